@@ -102,6 +102,7 @@ class Teensy(SyncSource):
         self._watchdog_s = config.watchdog
         self._loaded = False
         self._over = threading.Event()
+        self._lowered = 0
         port = SerialPort(self.name, resolve(config.port, surroundings.ports), surroundings.tap)
         self._line = TeensyLine(self.name, port, reply_s)
         try:
@@ -156,9 +157,12 @@ class Teensy(SyncSource):
 
     def run(self) -> None:
         """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
-        the board may have started although its answer did not arrive."""
+        the board may have started although its answer did not arrive, or another thread has taken outputs low."""
+        lowered = self._lowered
         try:
             super().run()
+            if self._lowered != lowered:
+                raise DeviceFault(f"{self.name}: run was ended by gate_low or abort; run again")
         except WrongState:
             raise  # nothing was sent
         except BaseException:
@@ -189,9 +193,11 @@ class Teensy(SyncSource):
         threading.Thread(target=_feed_watchdog, args=feeding, name="Teensy watchdog", daemon=True).start()
 
     def _do_gate_low(self) -> None:
+        self._lowered += 1
         self._line.lower("low", OUT_GATE)
 
     def _do_abort(self) -> None:
+        self._lowered += 1
         self._line.lower("abort", ~0)
 
     def _do_status(self) -> SyncStatus:

@@ -8,10 +8,11 @@ import itertools
 import random
 import re
 import threading
+from contextlib import suppress
 from typing import Literal, cast
 
 from drivers.clock import now_s
-from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import CommandRefused, DeviceError, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import SyncStatus
 from drivers.transports.serial_port import SerialPort
 
@@ -37,8 +38,8 @@ class TeensyLine:
     def __init__(self, name: str, port: SerialPort, reply_s: float) -> None:
         self._name, self.port, self._reply_s = name, port, reply_s
         self._tags = itertools.count(random.getrandbits(31))  # not those of an earlier host, whose replies may linger
-        self._turn = threading.Lock()
-        self._writing = threading.Lock()
+        self._turn = threading.RLock()  # re-entrant, should an interrupt leave it held
+        self._writing = threading.RLock()
         self._heard = ""
 
     def connect(self) -> re.Match[str]:
@@ -105,7 +106,10 @@ class TeensyLine:
             )
 
     def close(self) -> None:
-        """Close the port, once no other thread reads from it."""
+        """Close the port, once no other thread reads from it. Before that the board is told once more to take its
+        outputs low, which an interrupt may have prevented."""
+        with suppress(DeviceError):
+            self._write("abort")
         with self._turn:
             self.port.close()
 
