@@ -2,7 +2,8 @@
 
 Protocol: docs/reference/teensy.md, version 1. The board itself ends a held pulse when the scan marker falls. It takes
 its outputs low when the port closes, so also when the process that holds it dies. Its watchdog is for a computer that
-freezes with the port open, and for a port that a fork of the process still holds.
+freezes with the port open, and for a port that another process, such as a fork, still holds open: Linux lowers DTR only
+with the last one (tty_port_close_start in drivers/tty/tty_port.c).
 
 The driver's own thread feeds the watchdog, since nobody else asks a sync source regularly, neither a notebook nor the
 guard. The guard watches the application, and the application the guard, so this thread need not: it ends with its
