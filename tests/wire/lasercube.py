@@ -1,4 +1,4 @@
-"""A LaserCube / LaserDock board as its firmware behaves (docs/reference/devices/lasercube.md; vendor's library 51d13bc).
+"""A LaserCube / LaserDock board as its firmware behaves (docs/reference/devices/lasercube.md; vendor's code 51d13bc).
 
 It has one ring of samples, played at the set rate while the output is on and there are any, and commands with replies
 of 64 bytes. While the output is off, and once the ring is cleared, X and Y stand at the centre. What happens when the
