@@ -17,7 +17,7 @@ needs rows, not speeds. A row delay that is known from elsewhere is combined wit
 contradict each other significantly; if nothing is known it is 0.
 
 A constant delay of the markers behind the mirror's command (the scanner's colour outputs trail its mirror outputs by
-some microseconds, docs/reference/hardware.md) shortens both lags; they are then right for binding with the same
+some microseconds, docs/reference/devices/helios.md) shortens both lags; they are then right for binding with the same
 markers. A marker of the wrong polarity shows in the binding; the gate's delay shows in the frames at its edges
 (`gate_fit`).
 """

@@ -39,7 +39,8 @@ _log = logging.getLogger(__name__)
 SIGN_OF_LIFE_S = 0.05
 """Time between the guard's own signs of life."""
 POLL_S = 1.0
-"""Time between questions to an armed laser about interlock and faults (docs/reference/hardware.md: at 1 Hz or more)."""
+"""Time between questions to an armed laser about interlock and faults: at most 1 s
+(docs/reference/hardware.md, Lasers on a serial line)."""
 END_CHECK_S = 0.2
 """Time between checks whether the gate's program has ended, while an application at work is late with its frames."""
 GATE_FIRST_S = 0.1

@@ -1,6 +1,6 @@
 """The Cobolt (Huebner) 06-01 line laser, gated by its digital modulation input.
 
-Commands and replies are in docs/reference/hardware.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09),
+Commands and replies are in docs/reference/devices/cobolt.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09),
 python-microscope `lights/cobolt.py`, and the vendor's adapter for Micro-Manager (mmCoreAndDevices 8431eb1,
 DeviceAdapters/CoboltOfficial). Old firmware may send junk before a reply. The laser monitors its temperatures itself
 and reports fault 1.
@@ -163,7 +163,8 @@ FAMILIES = {
     "06-01": r"-06-.*-1\d{3}(-C)?$",
     "06-MLD": r"-06-0",
 }
-"""Patterns of each family's model numbers. The first match counts; the order is that of pycobolt."""
+"""Patterns of each family's model numbers, after pycobolt. The first match counts. Unlike there, an 06-DPL comes first,
+whatever its language."""
 
 
 def classify(model: str) -> str:

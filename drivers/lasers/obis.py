@@ -1,7 +1,7 @@
 """The Coherent OBIS LX/LS line laser, gated by its digital modulation input (`SOUR:AM:EXT DIG`).
 
-Commands and replies are in docs/reference/hardware.md. Sources: python-microscope `lights/obis.py` (69625e0), the bit
-tables of `obis.h`, the operator's manual (appendix C), mmCoreAndDevices PRs 645 and 531, and the status words of
+Commands and replies are in docs/reference/devices/obis.md. Sources: python-microscope `lights/obis.py` (69625e0), the
+bit tables of `obis.h`, the operator's manual (appendix C), mmCoreAndDevices PRs 645 and 531, and the status words of
 AllenNeuralDynamics/obis-laser debc218. The limits of the base plate's temperature, `SOUR:TEMP:PROT:BAS:LOW?` and
 `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
@@ -64,12 +64,12 @@ ERRORS = {
     -321: "memory",
     -350: "error queue is full",
     -400: "query unavailable",
-    500: "CCB",
-    510: "I2C",
-    520: "controller timed out",
-    900: "CCB timed out",
+    -500: "CCB",
+    -510: "I2C",
+    -520: "controller timed out",
+    -900: "CCB timed out",
 }
-"""Meaning of `ERR-nnn` (docs/reference/hardware.md)."""
+"""Meaning of `ERR-nnn`, which may also come without the minus (docs/reference/devices/obis.md)."""
 
 
 class ObisFraming:
@@ -114,7 +114,7 @@ class ObisFraming:
     def refusal(self, reply: str) -> str | None:
         """The error reply with its meaning; None if the reply is no error."""
         error = _ERROR.fullmatch(reply)
-        return f"{reply} ({ERRORS.get(int(error[1]), 'no known number')})" if error is not None else None
+        return f"{reply} ({ERRORS.get(-abs(int(error[1])), 'no known number')})" if error is not None else None
 
 
 EMISSION = 0x2
@@ -124,7 +124,7 @@ CDRH_DELAY = 0x10
 WARM_UP = 0x100
 KEY_OFF = 0x0200_0000
 INTERLOCK = 0x0400_0000
-"""Bits of `SYST:STAT?`. The last two are less certain: inferred from samples (docs/reference/hardware.md)."""
+"""Bits of `SYST:STAT?`. The last two are less certain: inferred from samples (docs/reference/devices/obis.md)."""
 
 FAULTS = {
     0x1: "base temperature",
@@ -140,9 +140,12 @@ FAULTS = {
     0x400: "TEC",
     0x800: "CCB",
     0x1000: "diode limit",
+    0x2000: "does not reach its power",
     0x4000: "photodiode",
     0x8000: "fatal",
+    0x1_0000: "start-up",
     0x2_0000: "watchdog reset",
+    0x4_0000: "field calibration",
     0x10_0000: "over-power",
 }
 """Bits of `SYST:FAUL?`."""

@@ -7,7 +7,7 @@ The paths lead to the first point, to a stop and to the dump angle:
     brake  constant deceleration from the mirror's present speed
 
 DACs pass the steps of their input to the galvo as they are, and a full-range jump at every point can overheat it
-(docs/reference/hardware.md, Helios). So no path contains a jump.
+(docs/reference/devices/helios.md). So no path contains a jump.
 """
 
 import math

@@ -1,5 +1,5 @@
-"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/reference/hardware.md; vendor's firmware v6 and
-SDK v11).
+"""Scanner kind `helios`: a galvo behind a Helios laser DAC on USB (docs/reference/devices/helios.md; vendor's firmware
+v6 and SDK v11).
 
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
 

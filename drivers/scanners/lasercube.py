@@ -1,4 +1,4 @@
-"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/hardware.md).
+"""Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/devices/lasercube.md).
 
     outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
               reversed, unlike in the vendor's program: the calibration says in which direction a command leads

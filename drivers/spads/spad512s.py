@@ -1,6 +1,6 @@
 """Pi Imaging SPAD512S (SPAD512^2) through its vendor's program, which serves commands and pixels on a local TCP port.
 
-Facts and their sources: docs/reference/hardware.md. `spad512s_line` talks to the program. In short:
+Facts and their sources: docs/reference/devices/spad512s.md. `spad512s_line` talks to the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
 - `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit. tInt is in

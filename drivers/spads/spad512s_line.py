@@ -1,5 +1,5 @@
 """The connection to a SPAD512S's vendor program: text commands, their answers, and the device's identity
-(docs/reference/hardware.md).
+(docs/reference/devices/spad512s.md).
 
 Sources there: `nirrafa/SPAD512S-remote-gui` theoretical_info/piimaging_examples and docs/, `cwseitz/SPAD512`
 SPAD512/instruments/SPAD512S.py. The protocol has neither framing nor request numbers, and serves one client. Commands

@@ -1,6 +1,6 @@
 """Opening an SPB1 device: USB chip, identity registers, test pattern, and the registers written before START.
 
-Facts: docs/reference/hardware.md and docs/reference/spb1-usb.md.
+Facts: docs/reference/devices/spb1-usb-chips.md and docs/reference/spb1-usb.md.
 
 The USB chips differ in ids and endpoints, and an FT601 needs a session. Sources: `VicidominiLab` BrightEyes-TTM 8f8d8d8
 (FX3 with the AN65974 firmware, 04B4:00F1, bulk IN 0x81); `apertus-open-source-cinema/ft60x-rs` and
@@ -204,7 +204,7 @@ Chip = Literal["fx3", "ft601"]
 LABEL = "SPB1 SPAD"
 _SESSION_OUT = 0x01
 _COMMAND = struct.Struct("<IBBHIII")
-"""index, pipe, command, 0, length, 0, 0 (docs/reference/hardware.md, USB chips of SPB1 boards)."""
+"""index, pipe, command, 0, length, 0, 0 (docs/reference/devices/spb1-usb-chips.md)."""
 _ABORT, _STREAM, _CLEAR = 0, 2, 3
 _STREAM_BYTES = 1 << 20
 _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152

@@ -1,8 +1,8 @@
 """PrawnDO, a pulse generator on a Raspberry Pi Pico: sixteen outputs, 10 ns steps, a trigger, text over USB serial.
 
-Facts: docs/reference/hardware.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
-(BSD). Outputs (docs/reference/hardware.md, Wiring and timing): unless the config says otherwise, GPIO0 triggers the
-SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
+Facts: docs/reference/devices/prawndo.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output
+3fecbdd (BSD). Outputs (docs/reference/hardware.md, Wiring and timing): unless the config says otherwise, GPIO0 triggers
+the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
 
 The firmware has neither loops nor a watchdog. So programs are written out in full and end with two words that hold
 everything low, whatever happens to the host. The firmware cannot read its pins while a program runs, nor report whether
@@ -124,7 +124,7 @@ def _check_waits(period: NDArray[np.void], repeats: int, board: ProgramLimits) -
 
 
 INTERNAL_HZ = 100_000_000
-"""The board's own clock (docs/reference/hardware.md)."""
+"""The board's own clock (docs/reference/devices/prawndo.md)."""
 MAX_WORDS = {"board: pico1": 30_000, "board: pico2": 60_000}
 OLDEST_FIRMWARE = (1, 3, 1)
 """Oldest firmware accepted. Before it `swr` waits for a trigger, so that one marker would start two words, and `man`

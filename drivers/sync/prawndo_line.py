@@ -1,8 +1,8 @@
 """Commands and answers of a PrawnDO on its serial line, and how its outputs are taken low whatever is under way.
 
-The firmware does not mark where an answer begins or ends (docs/reference/hardware.md). So every command is sent between
-two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is late,
-repeated or missing is recognised. Queries on which the safety of the light depends are sent twice. Taking the
+The firmware does not mark where an answer begins or ends (docs/reference/devices/prawndo.md). So every command is sent
+between two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is
+late, repeated or missing is recognised. Queries on which the safety of the light depends are sent twice. Taking the
 outputs low overtakes all other commands.
 """
 

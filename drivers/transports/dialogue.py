@@ -1,10 +1,10 @@
 """A dialogue with a device that answers one command at a time: paced, checked, and synchronised again after a lost
 reply.
 
-Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, lasers), so a late one would be taken
-for the answer to the next command. Therefore the input is dropped before each command, and each reply must have the
-form that its command calls for. If a reply has another form, or none comes, the line is drained and a query is
-sent whose answer is known. The form of a make's commands and replies is its `Framing`.
+Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, Lasers on a serial line), so a late one
+would be taken for the answer to the next command. Therefore the input is dropped before each command, and each reply
+must have the form that its command calls for. If a reply has another form, or none comes, the line is drained and a
+query is sent whose answer is known. The form of a make's commands and replies is its `Framing`.
 
 Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
 released it; with a plain lock the thread that wants to switch the laser off could wait for ever.

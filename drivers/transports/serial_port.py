@@ -42,7 +42,7 @@ BAUD = 115_200
 """Rate of a port whose device asks for no other."""
 AGAIN_S = 0.11
 """Time between the same bytes sent again: a Cobolt ignores a command within 0.1 s of its last answer
-(docs/reference/hardware.md)."""
+(docs/reference/devices/cobolt.md)."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 

@@ -1,8 +1,10 @@
 """The documentation keeps what it promises: its links lead somewhere, its commands and modules exist."""
 
+import ast
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -69,6 +71,43 @@ def test_files_and_modules_that_are_named_exist(page: Path) -> None:
 )
 def test_a_name_of_what_is_not_there_is_found(code: str) -> None:
     assert missing_files(code) + missing_names(code) == [code]
+
+
+@pages
+def test_facts_have_sources_and_name_code_that_exists(page: Path) -> None:
+    assert bad_rows(page.read_text()) == []
+    for code in inline_code(page.read_text()):
+        if place := re.fullmatch(r"([\w/]+\.py):([A-Za-z_][\w.]*)", code):
+            assert place[2] in defined(place[1]), f"there is no {code}"
+
+
+def test_a_fact_without_a_source_and_a_symbol_that_is_not_there_are_found() -> None:
+    wrong = [r"| c \| d | | - | - |", "| e | f | - |"]
+    head = "| fact | source | driver | emulator |\n|---|---|---|---|\n| a | b | - | - |\n"
+    assert bad_rows(head + "\n".join([*wrong, "", "| g |"])) == wrong
+    assert {"PAGES", "Path", "defined", "defined.names"} & defined("tests/unit/test_docs.py") == {"PAGES", "defined"}
+
+
+def bad_rows(text: str) -> list[str]:
+    """Rows of tables of facts that have not four cells with text."""
+    tables = re.findall(r"^\| fact \| source \| driver \| emulator \|\n\|[-|]+\n((?:\|.*\n?)*)", text, re.M)
+    rows = [row for table in tables for row in table.splitlines()]
+    return [row for row in rows if not re.fullmatch(r"\|( *[^ |\\]([^|\\]|\\.)*\|){4}", row)]
+
+
+@cache
+def defined(path: str) -> set[str]:
+    """Names that a file defines at its top, and those of its classes, dotted. Empty if there is no such file."""
+    todo = [("", node) for node in ast.parse((ROOT / path).read_text()).body] if (ROOT / path).exists() else []
+    names = set()
+    for before, node in todo:
+        if isinstance(node, ast.ClassDef):
+            todo += [(f"{before}{node.name}.", inner) for inner in node.body]
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(before + node.name)
+        for target in getattr(node, "targets", [getattr(node, "target", ast.Pass())]):
+            names |= {before + one.id for one in ast.walk(target) if isinstance(one, ast.Name)}
+    return names
 
 
 @pages

@@ -1,7 +1,8 @@
-"""A LaserCube / LaserDock board as its firmware behaves (docs/reference/hardware.md; vendor's library 51d13bc).
+"""A LaserCube / LaserDock board as its firmware behaves (docs/reference/devices/lasercube.md; vendor's code 51d13bc).
 
-It has one ring of samples, played at the set rate as soon as there are any, and commands with replies of 64 bytes. What
-happens when the ring runs empty is not documented: this model holds the last sample or repeats the last ones, as
+It has one ring of samples, played at the set rate while the output is on and there are any, and commands with replies
+of 64 bytes. While the output is off, and once the ring is cleared, X and Y stand at the centre. What happens when the
+ring runs empty is known from the board's ancestor only: this model holds the last sample, or repeats the last ones, as
 configured.
 """
 
@@ -11,13 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backend.wire.firmware.helios import DAC_STEPS, DacModel, Played
+from sim_backend.wire.firmware.helios import CENTRE, DAC_STEPS, DacModel, Played
 from sim_backend.wire.serve.usb_model import AlternateSpec, DeviceSpec, EndpointSpec
 
 COMMANDS, REPLIES, SAMPLES = 0x01, 0x81, 0x03
 RED, GREEN, BLUE, PLAYING = 0, 1, 2, 3
 """Lines of the history; the last one is high while samples of the ring are played."""
+RING_SAMPLES = 768
 _REPEATED_SAMPLES = 64
+_DONE, _FAILED, _UNKNOWN = 0x00, 0x01, 0xFF
+"""Second byte of a reply."""
 
 
 class LaserCubeModel(DacModel):
@@ -27,9 +31,9 @@ class LaserCubeModel(DacModel):
         self,
         *,
         serial: str | None = "LC1",
-        product_name: str = "LaserCube",
+        product_name: str = "Laserdock",
         when_empty: Literal["hold", "repeat"] = "hold",
-        ring: int = 4096,
+        ring: int = RING_SAMPLES,
         highest_rate_hz: int = 40_000,
         clock_error: float = 0.0,
         axis: str = "x",
@@ -38,14 +42,14 @@ class LaserCubeModel(DacModel):
         spec = DeviceSpec(
             vendor=0x1FC9,
             product=0x04D8,
-            manufacturer="Wicked Lasers",
+            manufacturer="WICKED",
             product_name=product_name,
             serial=serial,
-            speed="high",
+            speed="full",
             alternates=(
-                AlternateSpec(0, 0, (EndpointSpec(COMMANDS, "bulk", 512), EndpointSpec(REPLIES, "bulk", 512))),
+                AlternateSpec(0, 0, (EndpointSpec(COMMANDS, "bulk", 64), EndpointSpec(REPLIES, "bulk", 64))),
                 AlternateSpec(1, 0),
-                AlternateSpec(1, 1, (EndpointSpec(SAMPLES, "bulk", 512),)),
+                AlternateSpec(1, 1, (EndpointSpec(SAMPLES, "bulk", 64),)),
             ),
         )
         super().__init__(spec, commands=COMMANDS, replies=REPLIES, points=SAMPLES)
@@ -63,10 +67,13 @@ class LaserCubeModel(DacModel):
     def moving(self, now_s: float) -> bool:
         """Whether samples are being played."""
         self.advance(now_s)
-        return self._queued > 0
+        return self.enabled and self._queued > 0
 
     def advance(self, now_s: float) -> None:
-        """Play on until now."""
+        """Play on until now. While the output is off the ring keeps its samples."""
+        if not self.enabled:
+            self._played_to_s = now_s
+            return
         rate_hz = self.rate_hz * (1 + self._clock_error)
         while self._queued:
             due = int((now_s - self._played_to_s) * rate_hz + 1e-6)
@@ -85,8 +92,6 @@ class LaserCubeModel(DacModel):
     def _play(self, block: NDArray[np.uint16], rate_hz: float) -> None:
         start_s, self._played_to_s = self._played_to_s, self._played_to_s + len(block) / rate_hz
         levels = np.stack([block[:, 0] & 0xFF, block[:, 0] >> 8, block[:, 1], np.full(len(block), 255)], axis=1)
-        if not self.enabled:
-            levels[:, :3] = 0
         command = block[:, 2 if self._axis == "x" else 3] / DAC_STEPS * 2 - 1
         self.history.play(Played(start_s, self._played_to_s, 1 / rate_hz, command, levels.astype(np.uint8)))
 
@@ -122,14 +127,19 @@ class LaserCubeModel(DacModel):
             0x8C: b"\x0c",
         }
         match data[0]:
-            case 0x80:
+            case 0x80 if data[1] in (0, 1):
                 self.enabled = bool(data[1])
-            case 0x82:
-                self.rate_hz = int.from_bytes(data[1:5], "little") + self.rate_offset_hz
+                if not self.enabled:
+                    self.history.cut(now_s, CENTRE)
+            case 0x82 if 0 < (rate_hz := int.from_bytes(data[1:5], "little")) <= self._highest_rate_hz:
+                self.rate_hz = rate_hz + self.rate_offset_hz
+            case 0x80 | 0x82:
+                return _FAILED, b""
             case 0x8D:
                 self._halt(now_s)
+                self.history.cut(now_s, CENTRE)
             case opcode if opcode in answers:
-                return 0, answers[opcode]
+                return _DONE, answers[opcode]
             case _:
-                return 1, b""
-        return 0, b""
+                return _UNKNOWN, b""
+        return _DONE, b""

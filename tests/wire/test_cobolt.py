@@ -1,5 +1,5 @@
-"""The Cobolt driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, every
-trap."""
+"""The Cobolt driver through real pyserial against a model of its firmware: bytes of docs/reference/devices/cobolt.md,
+every trap."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def told(model: CoboltModel) -> list[str]:
         return [command for command in model.commands if not command.endswith("?")]
 
 
-# The bytes themselves, from docs/reference/hardware.md.
+# The bytes themselves, from docs/reference/devices/cobolt.md.
 
 
 def test_the_model_answers_as_the_manual_says() -> None:
@@ -70,7 +70,7 @@ def test_the_gate_is_set_in_the_dark_before_the_start(family: Family, sent: str)
     assert told(CoboltModel(family)) == sent.split(", ")
 
 
-# The traps of docs/reference/hardware.md, one test each.
+# The traps of docs/reference/devices/cobolt.md, one test each.
 
 
 def test_trap_commands_closer_than_100_ms_are_not_answered() -> None:

@@ -1,4 +1,4 @@
-"""The Helios driver against the firmware model. Golden bytes and traps: docs/reference/hardware.md."""
+"""The Helios driver against the firmware model. Golden bytes and traps: docs/reference/devices/helios.md."""
 
 import logging
 import struct
@@ -178,6 +178,18 @@ def test_a_refused_frame_disarms_the_endpoint_until_the_next_status_question() -
         assert (model.refused, model.played) == (1, 1)
 
 
+def test_a_frame_that_begins_or_ends_makes_the_endpoint_ready_without_a_question() -> None:
+    clock, model = VirtualClock(), HeliosModel()
+    frame = bytes(7 * 44) + struct.pack("<HHB", 25001, 44, 2)
+    with closing(open_device(HELIOS, "usb", {0: 1}, plug(model, clock).bus)) as link:
+        for _ in range(2):  # the first one plays at once, the second one waits
+            link.write(FRAMES, frame, 0.5)
+        assert model.played == 1
+        for _ in range(2):  # when the second one begins, the third one may come
+            link.write(FRAMES, frame, 0.5)
+        assert model.refused == 0
+
+
 def test_frames_hold_at_most_4095_points_however_long_they_may_last() -> None:
     model = HeliosRecorder()
     with opened("helios", model, frame="500 ms") as (device, _):
@@ -340,6 +352,8 @@ def test_giving_the_interface_back_stops_the_mirror_as_when_the_process_is_kille
     for owner in list(plugged.attached._claims.values()):
         plugged.attached.close(owner)
     assert not model.moving(plugged.now_s())
+    where = model.history.command(plugged.now_s() + np.array([0.09, 0.11]))
+    assert (where == CENTRE).tolist() == [False, True]  # as after STOP
     with pytest.raises(DeviceError):
         device.close()
 

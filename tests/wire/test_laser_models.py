@@ -1,4 +1,5 @@
-"""The models of the OBIS and of Cobolt lasers alone: bytes in, bytes out, against the tables in hardware.md."""
+"""The models of the OBIS and of Cobolt lasers alone: bytes in, bytes out, against the tables of
+docs/reference/devices."""
 
 import pytest
 

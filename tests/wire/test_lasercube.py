@@ -1,6 +1,5 @@
-"""The LaserCube driver against the firmware model. Golden bytes: docs/reference/hardware.md."""
+"""The LaserCube driver against the firmware model. Golden bytes: docs/reference/devices/lasercube.md."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,45 +11,23 @@ from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.scanners.dac_scanner import PointSlice
 from drivers.scanners.lasercube import LaserCube, encode
 from sim_backend.wire.firmware.helios import CENTRE
-from sim_backend.wire.serve.usb_model import EndpointSpec, Stall
+from sim_backend.wire.serve.usb_model import Stall
 from tests.wire import scanners
-from tests.wire.lasercube import BLUE, COMMANDS, GREEN, RED, SAMPLES, LaserCubeModel
+from tests.wire.lasercube import BLUE, COMMANDS, GREEN, RED, REPLIES, SAMPLES, LaserCubeModel
 from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play, plug
 
 STEP = 2 / 4095
 
 
-class Laserdock(LaserCubeRecorder):
-    """A board that its owners have measured and whose ancestor's firmware is public (drivers/scanners/lasercube.py).
+class Fullest(LaserCubeRecorder):
+    """Notes the most samples that its ring held."""
 
-    It has a ring of 768 samples, which it plays only while its output is on. Without output, and when the ring is
-    cleared, X and Y are at the centre.
-    """
-
-    def __init__(self, clock: VirtualClock | None = None, late: int = -1, **options: Any) -> None:
-        super().__init__(clock, late, **{"ring": 768, "product_name": "Laserdock", **options})
-        full_speed = tuple(
-            replace(one, endpoints=tuple(EndpointSpec(end.address, "bulk", 64) for end in one.endpoints))
-            for one in self.spec.alternates
-        )
-        self.spec = replace(self.spec, manufacturer="WICKED", speed="full", alternates=full_speed)
-        self.fullest = 0
-
-    def advance(self, now_s: float) -> None:
-        if self.enabled:
-            super().advance(now_s)
-        else:
-            self._played_to_s = now_s
+    fullest = 0
 
     def _take_points(self, data: bytes, now_s: float) -> int | None:
         taken = super()._take_points(data, now_s)
         self.fullest = max(self.fullest, self._queued)
         return taken
-
-    def _command(self, data: bytes, now_s: float) -> None:
-        if data in (b"\x80\x00", b"\x8d\x00"):
-            self.history.cut(now_s, CENTRE)
-        super()._command(data, now_s)
 
 
 def test_samples_are_the_bytes_of_the_manual() -> None:
@@ -58,6 +35,31 @@ def test_samples_are_the_bytes_of_the_manual() -> None:
     points = PointSlice(np.array([1.0, -1.0, 0.0]), markers, np.ones(3, bool))
     assert encode(points, "x", markers=True).hex(" ", 8) == "00ff0000ff0f0008 0000ff0000000008 ff00000000080008"
     assert encode(points, "y", markers=False).hex(" ", 8) == "000000000008ff0f 0000000000080000 0000000000080008"
+
+
+def test_the_model_keeps_its_ring_and_stands_at_the_centre_while_the_output_is_off() -> None:
+    model = LaserCubeModel()
+    far = np.tile(np.array([0, 0, 4095, 0x800], "<u2"), 64).tobytes()
+
+    def sent(command: bytes, now_s: float) -> bytes:
+        model.out(COMMANDS, command, now_s)
+        reply = model.inp(REPLIES, 64, now_s)
+        assert isinstance(reply, bytes)
+        return reply
+
+    assert model.out(SAMPLES, far, 0.0) == len(far)
+    assert sent(b"\x8a", 1.0)[2:6] == (768 - 64).to_bytes(4, "little")
+    assert model.history.command(np.array([1.0]))[0] == CENTRE
+    sent(b"\x80\x01", 1.0)
+    assert sent(b"\x8a", 2.0)[2:6] == (768).to_bytes(4, "little")
+    assert model.history.command(np.array([2.0]))[0] == 1.0
+    for command in (b"\x8d\x00", b"\x80\x00"):
+        model.out(SAMPLES, far, 3.0)
+        model.advance(4.0)
+        sent(command, 4.0)
+        assert model.history.command(np.array([4.1]))[0] == CENTRE
+    codes = [sent(command, 5.0)[1] for command in (b"\x99", b"\x80\x02", b"\x82" + (41_000).to_bytes(4, "little"))]
+    assert codes == [0xFF, 1, 1]
 
 
 def test_it_is_found_and_left_with_its_output_off_and_its_ring_empty() -> None:
@@ -100,7 +102,7 @@ def test_its_own_lasers_stay_dark_unless_the_config_says_where_the_colours_lead(
 
 @pytest.mark.parametrize("colours", ["dark", "markers"])
 def test_the_output_is_on_for_the_whole_run_since_the_ring_is_not_played_otherwise(colours: str) -> None:
-    model = Laserdock()
+    model = LaserCubeRecorder()
     with opened("lasercube", model, colours=colours) as (device, plugged):
         wave, began_s = cosine(device), plugged.now_s()
         play(device, 2)
@@ -116,7 +118,7 @@ def test_the_output_is_on_for_the_whole_run_since_the_ring_is_not_played_otherwi
 
 
 def test_the_mirror_never_jumps_and_stays_at_the_dump_angle_until_it_is_closed() -> None:
-    clock, model = VirtualClock(), Laserdock()
+    clock, model = VirtualClock(), LaserCubeRecorder()
     with opened("lasercube", model, clock, max_point_rate="25 kHz", park=0.8) as (device, plugged):
         began_s, most = plugged.now_s(), device.limits.step
         play(device, 1)
@@ -137,7 +139,7 @@ def test_the_mirror_never_jumps_and_stays_at_the_dump_angle_until_it_is_closed()
 def test_a_ring_of_768_samples_is_used_up_to_its_last_packet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scanners, "LATE_S", 0.022)  # half of the ring lasts 15 ms, all of it 30 ms
     clock = VirtualClock()
-    model = Laserdock(clock, late=60)
+    model = Fullest(clock, late=60)
     with opened("lasercube", model, clock) as (device, _):
         play(device, 3)
         assert device.status.fault is None
@@ -146,12 +148,12 @@ def test_a_ring_of_768_samples_is_used_up_to_its_last_packet(monkeypatch: pytest
 
 @pytest.mark.parametrize("product_name", ["Laserdock", "Laserdock.", "LaserCube", "LASERDOCK"])
 def test_the_product_string_is_compared_without_case(product_name: str) -> None:
-    with opened("lasercube", Laserdock(product_name=product_name)) as (device, _):
+    with opened("lasercube", LaserCubeModel(product_name=product_name)) as (device, _):
         assert "LaserCube" in device.identity
 
 
 def test_it_opens_by_itself_with_plain_numbers() -> None:
-    clock, model = VirtualClock(), Laserdock()
+    clock, model = VirtualClock(), LaserCubeRecorder()
     board: dict[str, Any] = {"usb_backend": plug(model, clock).bus, "clock": clock}
     galvo: dict[str, Any] = {"max_velocity_per_s": 2000.0, "max_acceleration_per_s2": 2e6}
     with LaserCube.open(**galvo, max_point_rate_hz=25e3, buffer_s=0.02, park=0.5, **board) as device:

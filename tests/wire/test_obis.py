@@ -1,5 +1,5 @@
-"""The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/hardware.md, and every
-trap."""
+"""The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/devices/obis.md, and
+every trap."""
 
 from contextlib import closing
 
@@ -18,7 +18,7 @@ from drivers.errors import (
 )
 from drivers.guard import Guard
 from drivers.guard.process import Rescue
-from drivers.lasers.obis import FAULTS, ObisConfig
+from drivers.lasers.obis import FAULTS, ObisConfig, ObisFraming
 from drivers.registry import Surroundings
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
@@ -32,7 +32,7 @@ def sets(model: ObisModel) -> list[str]:
     return [command for command in model.commands if not command.endswith("?")]
 
 
-# The bytes themselves, from docs/reference/hardware.md.
+# The bytes themselves, from docs/reference/devices/obis.md.
 
 
 def test_the_model_answers_as_the_manual_says() -> None:
@@ -43,7 +43,9 @@ def test_the_model_answers_as_the_manual_says() -> None:
         (b"SOUR:AM:EXT DIG\r\n", b"OK\r\n"),
         (b"SOUR:AM:STAT ON\r\n", b"OK\r\n"),
         (b"SOUR:AM:EXT DIG\r\n", b"ERR-200\r\n"),
-        (b"NONSENSE\r\n", b"ERR-109\r\n"),
+        (b"NONSENSE\r\n", b"ERR-100\r\n"),
+        (b"SYST:CDRH\r\n", b"ERR-109\r\n"),
+        (b"SYST:CDRH MAYBE\r\n", b"ERR-220\r\n"),
         (b"SYST:NON?\r\n", b"ERR-100\r\n"),
     ]:
         assert model.receive(sent, 0.0) == answered
@@ -197,7 +199,7 @@ def test_the_gate_is_set_up_while_off_and_on_comes_last(handshake: bool) -> None
         ]
 
 
-# The traps of docs/reference/hardware.md, one test each.
+# The traps of docs/reference/devices/obis.md, one test each.
 
 
 def test_trap_with_the_handshake_off_sets_answer_nothing_and_are_read_back() -> None:
@@ -369,12 +371,22 @@ def test_trap_error_numbers_come_in_place_of_the_answer_and_are_named() -> None:
         _ = laser.status
 
 
+@pytest.mark.parametrize(
+    ("reply", "meaning"), [("ERR-500", "CCB"), ("ERR500", "CCB"), ("ERR-520", "controller timed out"), ("OK", None)]
+)
+def test_errors_of_a_laser_box_are_named_with_and_without_a_minus(reply: str, meaning: str | None) -> None:
+    assert ObisFraming(None).refusal(reply) == (meaning and f"{reply} ({meaning})")
+
+
 def test_every_fault_bit_is_named_and_refuses_to_arm() -> None:
     by_hand = {
         0x1: "base temperature",
         0x400: "TEC",
+        0x2000: "does not reach its power",
         0x8000: "fatal",
+        0x10000: "start-up",
         0x20000: "watchdog reset",
+        0x40000: "field calibration",
         0x100000: "over-power",
     }
     assert by_hand.items() <= FAULTS.items()

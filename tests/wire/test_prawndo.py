@@ -1,4 +1,4 @@
-"""The PrawnDO: golden bytes of docs/reference/hardware.md, and a test named after each of its traps."""
+"""The PrawnDO: golden bytes of docs/reference/devices/prawndo.md, and a test named after each of its traps."""
 
 import threading
 
@@ -20,7 +20,7 @@ from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from tests.wire.lasers import PATIENCE_S, Silent, eventually
 from tests.wire.syncs import SWEEP, TriggerLine, board
 
-# The emulator, against bytes written by hand from docs/reference/hardware.md
+# The emulator, against bytes written by hand from docs/reference/devices/prawndo.md
 
 
 def answers(model: PrawnDoModel, *lines: bytes) -> list[bytes]:
@@ -81,7 +81,7 @@ def test_the_model_plays_cycles_of_ten_nanoseconds_from_the_trigger_on() -> None
 # Bytes that the driver sends
 
 
-def test_a_program_goes_out_as_hardware_md_writes_it() -> None:
+def test_a_program_goes_out_as_the_reference_writes_it() -> None:
     with board() as wire, wire.open() as device:
         sent = listen_to(wire.model)
         device.program([Pulse(OUT_MARKER, None), Pulse(OUT_GATE | OUT_FRAME, 1e-3)], 1)
@@ -150,7 +150,7 @@ def test_outputs_beyond_the_sixteen_and_an_output_with_two_uses_are_refused() ->
             wire.open(gate_output=2)
 
 
-# The traps of docs/reference/hardware.md, one test each
+# The traps of docs/reference/devices/prawndo.md, one test each
 
 
 def test_trap_the_trigger_is_a_level_so_waits_closer_than_a_scan_marker_are_refused() -> None:

@@ -1,10 +1,10 @@
 """Model of a Cobolt 06-01 laser's firmware: 06-MLD, 06-DPL or the newer SCPI-like language, key, autostart, faults.
 
-Each fact has its public source in the table of docs/reference/hardware.md. Commands end with CR, replies with CRLF. The
-model has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key needed after
-`l0`, `@cob0` and `@cob1` darken it, `l1` refused while autostart is enabled, `@cobasks?` unknown to 06-MLD, `gkses?`
-that says whether the key is in force but not how it is turned, powers in W (`p`) and mW (`slmp`, `slp`), numbers of
-`gom?` that mean other things in 06-DPL, `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
+Each fact has its public source in the table of docs/reference/devices/cobolt.md. Commands end with CR, replies with
+CRLF. The model has the traps of the real laser: no answer to a command sooner than 100 ms after the last reply, key
+needed after `l0`, `@cob0` and `@cob1` darken it, `l1` refused while autostart is enabled, `@cobasks?` unknown to
+06-MLD, `gkses?` that says whether the key is in force but not how it is turned, powers in W (`p`) and mW (`slmp`,
+`slp`), numbers of `gom?` that mean other things in 06-DPL, `ilk?` 1 = open, junk before replies, silent `!e` and `!d`.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""A Helios laser DAC as its firmware behaves, traps included (docs/reference/hardware.md; vendor's firmware v6,
+"""A Helios laser DAC as its firmware behaves, traps included (docs/reference/devices/helios.md; vendor's firmware v6,
 0952a2a).
 
 There are two buffers, one playing and one pending, and a status polled with 03. A frame whose length is a multiple of
@@ -243,13 +243,14 @@ class HeliosModel(DacModel):
         self._dead_until_s = -1.0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. Any other one stops it: colours
-        low, mirror at the centre.
+        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. Any other one stops it as STOP
+        does: colours low, and the mirror at the centre 100 ms later.
         """
         self.advance(now_s)
-        self._halt(now_s)
-        if alternate != 1:
-            self.history.cut(now_s, CENTRE)
+        if alternate == 1:
+            self._halt(now_s)
+        else:
+            self._stop(now_s)
         self._armed = alternate == 1
 
     def advance(self, now_s: float) -> None:
@@ -260,6 +261,7 @@ class HeliosModel(DacModel):
                 following = self._playing
                 self._record(following, self._ends_s)
             self._playing = self._pending = None
+            self._armed = True  # a frame that begins or ends makes the endpoint ready for the next one
             if following is not None:
                 self._play(following, self._ends_s)
 
@@ -271,9 +273,8 @@ class HeliosModel(DacModel):
     def _command(self, data: bytes, now_s: float) -> None:
         match data[0]:
             case 0x01:
-                self._halt(now_s)
-                self._dead_until_s = now_s + STOP_DEAD_S
-                self.history.cut(self._dead_until_s, CENTRE)
+                self._stop(now_s)
+                self._armed = True
             case 0x02:
                 self.shutter = bool(data[1])
             case 0x03:
@@ -331,7 +332,14 @@ class HeliosModel(DacModel):
 
     def _play(self, frame: _Frame, start_s: float) -> None:
         self._playing, self._ends_s = frame, start_s + frame.duration_s
+        self._armed = True
         self.played += 1
+
+    def _stop(self, now_s: float) -> None:
+        """Blank at once, refuse frames for 100 ms, and centre the mirror then."""
+        self._halt(now_s)
+        self._dead_until_s = now_s + STOP_DEAD_S
+        self.history.cut(self._dead_until_s, CENTRE)
 
     def _record(self, frame: _Frame, start_s: float) -> None:
         self.history.play(Played(start_s, start_s + frame.duration_s, frame.period_s, frame.x, frame.levels))

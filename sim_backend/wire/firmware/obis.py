@@ -1,6 +1,6 @@
 """Model of a Coherent OBIS laser's firmware: handshake on or off, warm-up, CDRH delay, interlock, key, fault words.
 
-Each fact has its public source in the table of docs/reference/hardware.md. Commands end with CR or LF, replies with
+Each fact has its public source in the table of docs/reference/devices/obis.md. Commands end with CR or LF, replies with
 CRLF; words may be written short (`SYST`) or long (`SYSTem`). The model has the traps of the real laser: set commands
 get no answer with the handshake off, ON during warm-up is deferred, emission follows ON by the CDRH delay, mode changes
 are refused while the laser is on (ERR-200), no status word has the bit 'ready', without its key it says that the
@@ -18,7 +18,7 @@ Words = Literal["plain", "marked", "ready"]
 """Form of a unit's status and fault words without a fault: see `ObisModel`."""
 
 OFF_BITS = 0xC800_0000
-"""Bits that are set in every sample status in docs/reference/hardware.md."""
+"""Bits that are set in every sample status in docs/reference/devices/obis.md."""
 POWERED = 0x1000
 """Status bit of the 12 V supply of the laser power (`LaserPowerVoltage` in `obis.h` of jamolnng/hapi)."""
 READY = 0x4
@@ -54,6 +54,8 @@ FORBIDDEN = "SYST:CDRH OFF"
 """The command that bypasses a safeguard: a driver that sends it has failed its test."""
 _SWITCHES = {"SYST:CDRH": "cdrh", "SYST:AUT": "autostart", "SOUR:TEMP:APR": "tec"}
 """Commands that switch one of the model's attributes."""
+_SETTINGS = ("SOUR:POW:LEV:IMM:AMPL", "SOUR:AM:INT", "SOUR:AM:EXT", "SOUR:AM:STAT", *_SWITCHES)
+"""All commands that set something about the laser."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -276,6 +278,8 @@ class ObisModel:
     def _set(self, command: str) -> int:
         """Obey a command that sets something; returns the error number, 0 for none."""
         name, _, value = command.partition(" ")
+        if name not in _SETTINGS:
+            return -100
         if not value:
             return -109
         if name == "SOUR:POW:LEV:IMM:AMPL":
@@ -285,15 +289,13 @@ class ObisModel:
             fits = mode in _MODES[self.series] and (mode in _INTERNAL) == name.endswith("INT")
             return self._change_mode(mode) if fits else -220
         if value not in ("ON", "OFF"):
-            return -100
-        if name == "SOUR:AM:STAT":
-            if value == "ON" and not self.able:
-                return -200
-            self._switch(value == "ON")
-        elif name in _SWITCHES:
+            return -220
+        if name in _SWITCHES:
             setattr(self, _SWITCHES[name], value == "ON")
-        else:
-            return -100
+            return 0
+        if value == "ON" and not self.able:
+            return -200
+        self._switch(value == "ON")
         return 0
 
     def _switch(self, on: bool) -> None:

@@ -1,9 +1,9 @@
 """The PrawnDO firmware 1.3 as a model: its commands, its program player and the levels of its outputs over time.
 
-Facts: docs/reference/hardware.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output 3fecbdd
-(BSD). Its traps are modelled too: a level trigger, short words that become waits, `abt` that leaves the outputs alone,
-`adm` that swallows everything until its last byte has come, refusals that quote a command with its line end, answers
-cut after 127 characters, and an external clock that is not checked and whose loss takes outputs 0 and 1 away.
+Facts: docs/reference/devices/prawndo.md, from `prawn_do/prawn_do.{c,pio}` of labscript-suite/prawn_digital_output
+3fecbdd (BSD). Its traps are modelled too: a level trigger, short words that become waits, `abt` that leaves the outputs
+alone, `adm` that swallows everything until its last byte has come, refusals that quote a command with its line end,
+answers cut after 127 characters, and an external clock that is not checked and whose loss takes outputs 0 and 1 away.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""The vendor's program of a SPAD512S as seen from its TCP port (docs/reference/hardware.md), traps included.
+"""The vendor's program of a SPAD512S as seen from its TCP port (docs/reference/devices/spad512s.md), traps included.
 
 A pure state machine: it gets commands and the time, and gives text and pixels. It takes frames of 1 bit and of the full
 width only. Their content comes upright from `frames` and is turned onto its side, as the real sensor delivers it.
