@@ -16,12 +16,13 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.errors import LimitExceeded, WrongState
 from drivers.interfaces import LineLaser
-from drivers.lasers import cobolt, obis
+from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.spads import spad512s, spb_usb
 from drivers.sync import prawndo
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
@@ -80,6 +81,7 @@ def test_the_cells_of_the_page_run_as_they_are_written(
 
 MAKES: list[tuple[type[LineLaser], Callable[[], Any]]] = [
     (cobolt.CoboltLaser, lambda: CoboltModel(warm_up_s=0.0)),
+    (ibeam.IbeamLaser, IbeamModel),
     (obis.ObisLaser, lambda: ObisModel(warm_up_s=0.0, cdrh_delay_s=0.0)),
 ]
 
@@ -156,7 +158,12 @@ def test_a_laser_is_opened_and_asked_by_itself_and_closed_for_good(
     with wire(make()) as (_, surroundings):
         with kind.open("emulated:laser", max_power_w=0.03, surroundings=surroundings) as laser:
             assert laser.limits.max_power_w == pytest.approx(0.03)
-            assert laser.ask("ilk?" if kind is cobolt.CoboltLaser else "SYST:LOCK?") in ("0", "ON", "OK")
+            asked = {
+                cobolt.CoboltLaser: ("ilk?", "0"),
+                ibeam.IbeamLaser: ("sta la", "OFF"),
+                obis.ObisLaser: ("SYST:LOCK?", "ON"),
+            }
+            assert laser.ask(asked[kind][0]) == asked[kind][1]
             assert laser.ask("nonsense?")  # a refusal is an answer
         with pytest.raises(WrongState):
             laser.ask("?")
