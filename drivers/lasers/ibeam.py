@@ -344,8 +344,9 @@ def _most_w(line: Dialogue) -> float:
 
 
 def _off(config: IbeamConfig) -> bytes:
-    """The bytes that switch off. The line end before them ends what a program that died had begun to send."""
-    return b"\r\nlaser off\r\n"
+    """The bytes that switch off. No line end goes before them: it would count as a command, and after two at once the
+    replies may come late. What a program that died had begun to send spoils the first of them, not the next."""
+    return b"laser off\r\n"
 
 
 KIND = Kind(config=IbeamConfig, create=create, off=_off)

@@ -79,7 +79,14 @@ def test_an_answer_is_read_up_to_ok_and_only_warnings_and_errors_refuse(answer: 
 def test_commands_and_the_bytes_of_off_end_with_crlf() -> None:
     assert IbeamFraming().encode("laser on") == b"laser on\r\n"
     assert ibeam.KIND.off is not None
-    assert ibeam.KIND.off(IbeamConfig.model_validate(USUAL)) == b"\r\nlaser off\r\n"
+    off = ibeam.KIND.off(IbeamConfig.model_validate(USUAL))
+    assert off == b"laser off\r\n"
+    model = IbeamModel(lag_gap_s=0.049)
+    model.shine(0.05)
+    for at_s, said in enumerate((b"channel 2 po", off, off)):  # a program that died, and the guard
+        model.receive(said, float(at_s))
+    assert not model.emitting
+    assert not model.lagging
 
 
 @pytest.mark.parametrize("echo", [True, False])

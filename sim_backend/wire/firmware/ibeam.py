@@ -2,10 +2,10 @@
 
 Each fact has its public source in the table of docs/reference/devices/ibeam.md. Words may be shortened (`la on`),
 commands end with CR, and an LF is ignored. An answer is CRLF, the lines, then `[OK]` and CRLF, or `CMD> ` without a
-line end while the prompt is on, as after power-up. The model has the traps of the real laser: powers are in mW unless `micro`
-follows, channel 1 is a bias that the digital input does not switch, `laser on` enables the default channel again,
-`disable ext` lets channel 2 shine, channel 2 cannot be switched while `ext` is enabled, errors end with `[OK]` too,
-`%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
+line end while the prompt is on, as after power-up. The model has the traps of the real laser: powers are in mW unless
+`micro` follows, channel 1 is a bias that the digital input does not switch, `laser on` enables the default channel
+again, `disable ext` lets channel 2 shine, channel 2 cannot be switched while `ext` is enabled, errors end with `[OK]`
+too, `%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
 
 The manual is not public. Made up here: numbers and texts of errors and of the lines of `talk gabby`, the text after a
 start, tables beyond the lines that clients look for, that an open interlock or key switches off and refuses `laser on`,
