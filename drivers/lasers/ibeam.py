@@ -171,18 +171,13 @@ class IbeamLaser(SerialLaser):
     def _fault(self, on: bool, mode: str) -> str | None:
         # A flipped bit may fake a fault, so what ends a scan is asked twice. If it hides one, the next poll finds it.
         if not on and self._told_on and not self._on() and self._told_on:  # a pause may have come meanwhile
-            return f"it went off by itself: its key, its interlock or a fault ({self._last_error()})"
+            return "it went off by itself: its key, its interlock or a fault; ask it 'list err'"
         if on and mode != _GATED and self._told_on and self._input_mode() != _GATED and self._told_on:
             return f"its light is under {mode}, not only the gate"
         clips = [self._if_known("sta clip", CLIP) for _ in range(2)]
         if all(clip is not None and clip[0] == "FAIL" for clip in clips):
             return "its power was clipped ('sta clip' says FAIL)"
         return None
-
-    def _last_error(self) -> str:
-        with suppress(DeviceError):
-            return f"'err' says {self._line.ask('err', TEXT)[:80]}"
-        return "it does not say which"
 
     def _if_known(self, command: str, form: re.Pattern[str]) -> re.Match[str] | None:
         """The reply to a question that not every unit may know; None if this one does not."""
@@ -259,8 +254,7 @@ class IbeamLaser(SerialLaser):
             self._require_no_stop()
             if clock.now_ns() >= give_up_ns:
                 raise DeviceFault(
-                    f"{self._name} is not on {_START_S:g} s after 'laser on' ({self._last_error()}); check its key and "
-                    "interlock"
+                    f"{self._name} is not on {_START_S:g} s after 'laser on'; check its key and interlock"
                 )
             clock.sleep(_LOOK_S)
 
