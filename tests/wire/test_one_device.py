@@ -48,6 +48,8 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
     with ExitStack() as stack:
         laser, sync = CoboltModel(warm_up_s=0.0), stack.enter_context(board())
         _, at_laser = stack.enter_context(wire(laser))
+        second = IbeamModel()
+        _, at_ibeam = stack.enter_context(wire(second))
         ids = replace(sync.server.endpoint, usb_ids=(0x2E8A, 0x000A))
         spad = stack.enter_context(TcpServer(Spad512sModel(frames)))
         clock = VirtualClock()
@@ -55,6 +57,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         bus.plug(helios)
         places = {
             cobolt: replace(at_laser, ports={"laser": at_laser.ports["laser"]}),
+            ibeam: at_ibeam,
             prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
         }
@@ -63,7 +66,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
         monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
         monkeypatch.setattr(time, "sleep", clock.sleep)
-        yield {"laser": laser, "sync": sync.model, "scanner": helios}
+        yield {"laser": laser, "ibeam": second, "sync": sync.model, "scanner": helios}
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.split("import ")[1].split()[0])
@@ -76,6 +79,7 @@ def test_the_cells_of_the_page_run_as_they_are_written(
     exec(compile(cell, str(PAGE), "exec"), {})
     assert capsys.readouterr().out
     assert not lab["laser"].emitting
+    assert not lab["ibeam"].emitting
     assert lab["sync"].status == 0 or lab["sync"].status == 5
 
 
