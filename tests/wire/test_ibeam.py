@@ -256,7 +256,7 @@ def test_a_laser_that_goes_off_by_itself_has_a_fault_until_it_is_armed_again() -
     with opened(model) as device:
         for lock, said in (
             (model.open_interlock, "laser locked"),
-            (lambda at_s: model.fail("too hot", at_s), "too hot"),
+            (lambda at_s: model.set_fault("too hot", at_s), "too hot"),
         ):
             device.arm(0.05)
             lock(model._now_s)

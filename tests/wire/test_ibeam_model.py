@@ -210,7 +210,7 @@ def test_an_open_interlock_a_key_or_a_fault_darkens_and_refuses_until_laser_on_i
     model.turn_key(False, 3.0)
     assert talk("la on") == answer(LOCKED)
     model.turn_key(True, 4.0)
-    model.fail("overtemperature", 5.0)
+    model.set_fault("overtemperature", 5.0)
     assert talk("la on") == answer("%SYS-F-050, overtemperature")
     assert not model.emitting
 

@@ -136,7 +136,7 @@ class IbeamModel:
         self._now_s, self.key_on, self.state_on = now_s, on, self.state_on and on
         self._tell()
 
-    def fail(self, text: str, now_s: float) -> None:
+    def set_fault(self, text: str, now_s: float) -> None:
         """Let a fatal fault switch the laser off, for as long as `fault` holds its text."""
         self._now_s, self.fault, self.state_on = now_s, text, False
         self._tell()
