@@ -1,15 +1,16 @@
 """The Toptica iBeam smart diode laser, gated by its digital modulation input (`enable ext`).
 
-Commands and replies, with their sources, are in docs/reference/hardware-ibeam-driver.md. No manual is public: the facts
-are those of other clients.
+Commands and replies, with their sources, are in docs/reference/devices/ibeam.md. No manual is public: the facts are
+those of other clients.
 
 The light is the sum of the channels. Channel 2 is the working level and the only one that the gate switches; channel 1
 is a bias that shines whatever the gate does. So every other channel is set to a level of 0, which is read back, and
 channel 2 gets its power last, once `sta ext` says that the input has control. `laser on` may bring back other channels
 than before, so they are looked at again after it. FINE would move the power to channel 1 and is switched off.
 
-Neither key nor interlock can be asked: both are None in `status`. A laser that was switched on and is found off reports
-a fault. `pause` is `laser off`, read back; no key is needed afterwards. `disarm` also sets channel 2 to 0.
+Neither key nor interlock can be asked: both are None in `status`. An armed laser that is found off, or with light that
+the gate does not switch, reports a fault. `pause` is `laser off`, read back; no key is needed afterwards. `disarm` also
+sets channel 2 to 0.
 
 The driver needs echo and prompt off and the usual amount of talk. Opening the laser sets this; `close` puts echo and
 prompt back once the laser is off, since the maker's own program needs the prompt. Levels, `ext`, FINE and talk are left
@@ -56,6 +57,8 @@ _QUIET_S, _SAID_S = 0.1, 1.0
 _UNIT_W = {"m": 1e-3, "u": 1e-6}
 _STEP_W = 1e-6
 """Levels are told in mW with three decimals."""
+_GATED = "digital"
+"""Input mode in which only the gate switches the light."""
 _WORKING = 2
 """The channel that the gate switches."""
 _START_S, _LOOK_S = 10.0, 0.2
@@ -72,12 +75,18 @@ class IbeamFraming:
         """Whether they were on when the port was opened."""
 
     def prepare(self, port: SerialPort) -> None:
-        """Switch echo and prompt off, whatever state they are in, and note that state."""
+        """Switch echo and prompt off, whatever state they are in, and note that state. Raises `DeviceFault` if the
+        laser answers each command with the reply to the last one."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
         self.echo, self.prompt = b"echo off" in echoed, _PROMPT in said + echoed
-        for command in ("prom off", "talk usual"):
+        for command in ("prom off", "talk usual", self.ping):
             _say(port, command)
+        if b"SN:" in _say(port, ""):
+            _say(port, "laser off")
+            raise DeviceFault(
+                "ibeam laser: its replies come one command late; it was told to switch off. Power-cycle it"
+            )
 
     def greets(self, reply: str) -> bool:
         """Whether the reply tells a serial number."""
@@ -140,8 +149,8 @@ class IbeamLaser(SerialLaser):
         return create(config_of(IbeamConfig, port=port, max_power=power, **settings), surroundings or alone())
 
     def _do_status(self) -> LaserStatus:
-        on = self._on()
-        fault = self._fault(on)
+        on, mode = self._on(), self._input_mode()
+        fault = self._fault(on, mode)
         warm = self._if_known("show temperature system", CELSIUS)
         power = self._if_known("show power", POWER) if on else None
         return LaserStatus(
@@ -151,7 +160,7 @@ class IbeamLaser(SerialLaser):
             fault=fault,
             key_on=None,
             warming_up=False,
-            input_mode=self._input_mode(),
+            input_mode=mode,
             temperature_c=None if warm is None else float(warm[1]),
             power_w=0.0 if not on else None if power is None else float(power[1]) * _UNIT_W[power[2]],
         )
@@ -159,19 +168,16 @@ class IbeamLaser(SerialLaser):
     def _on(self) -> bool:
         return self._line.ask("status laser", SWITCH) == "ON"
 
-    def _fault(self, on: bool) -> str | None:
+    def _fault(self, on: bool, mode: str) -> str | None:
         # A flipped bit may fake a fault, so what ends a scan is asked twice. If it hides one, the next poll finds it.
         if not on and self._told_on and not self._on() and self._told_on:  # a pause may have come meanwhile
-            return f"it went off by itself: its key, its interlock or a fault ({self._last_error()})"
+            return "it went off by itself: its key, its interlock or a fault; ask it 'list err'"
+        if on and mode != _GATED and self._told_on and self._input_mode() != _GATED and self._told_on:
+            return f"its light is under {mode}, not only the gate"
         clips = [self._if_known("sta clip", CLIP) for _ in range(2)]
         if all(clip is not None and clip[0] == "FAIL" for clip in clips):
             return "its power was clipped ('sta clip' says FAIL)"
         return None
-
-    def _last_error(self) -> str:
-        with suppress(DeviceError):
-            return self._line.ask("err", TEXT)[:80]
-        return "it does not say which"
 
     def _if_known(self, command: str, form: re.Pattern[str]) -> re.Match[str] | None:
         """The reply to a question that not every unit may know; None if this one does not."""
@@ -188,25 +194,25 @@ class IbeamLaser(SerialLaser):
         if self._line.ask("sta ext", SWITCH) != "ON":
             return "constant power"
         bias_w = sum(abs(level_w) for channel, level_w in self._levels().items() if channel != _WORKING)
-        return "digital" if bias_w < _STEP_W / 2 else f"digital over a bias of {bias_w * 1e3:g} mW"
+        return _GATED if bias_w < _STEP_W / 2 else f"digital over a bias of {bias_w * 1e3:g} mW"
 
     def _levels(self) -> dict[int, float]:
         return _levels(self._line.ask("show level power", LEVELS))
 
     def _check_health(self) -> None:
-        if not self._on():
-            self._told_on = False  # whatever switched it off: whether it comes on again, arming shows
+        if not self._on() or self._input_mode() != _GATED:
+            self._told_on = False  # whatever has changed it: whether it obeys again, arming shows
         super()._check_health()
 
     def _do_arm(self, power_w: float) -> None:
         try:
-            if not (self._told_on and self._on() and self._input_mode() == "digital"):
+            if not (self._told_on and self._on()):
                 self._enable()
             self._require_no_stop()
             self._set_level(_WORKING, power_w)
             mode = self._input_mode()
-            if mode != "digital":
-                raise DeviceFault(f"{self._name}: its light is under {mode}, not the gate; power-cycle it")
+            if mode != _GATED:
+                raise DeviceFault(f"{self._name}: its light is under {mode}, not only the gate; power-cycle it")
             self._require_no_stop()
         except BaseException:  # an interrupt too
             with suppress(DeviceError):  # the first error is the one to report
@@ -227,6 +233,7 @@ class IbeamLaser(SerialLaser):
         self._require_no_stop()
         self._start()
         self._gate()
+        self._told_on = True
 
     def _gate(self) -> None:
         """Enable the bias and the working channel, and the input. A channel cannot be enabled while the input is."""
@@ -247,11 +254,9 @@ class IbeamLaser(SerialLaser):
             self._require_no_stop()
             if clock.now_ns() >= give_up_ns:
                 raise DeviceFault(
-                    f"{self._name} is not on {_START_S:g} s after 'laser on' ({self._last_error()}); check its key and "
-                    "interlock"
+                    f"{self._name} is not on {_START_S:g} s after 'laser on'; check its key and interlock"
                 )
             clock.sleep(_LOOK_S)
-        self._told_on = True
 
     def _set_level(self, channel: int, power_w: float) -> None:
         """Set a channel's power and read it back."""
@@ -333,8 +338,9 @@ def _most_w(line: Dialogue) -> float:
 
 
 def _off(config: IbeamConfig) -> bytes:
-    """The bytes that switch off. The line end before them ends what a program that died had begun to send."""
-    return b"\r\nlaser off\r\n"
+    """The bytes that switch off. No line end goes before them: it would count as a command, and after two at once the
+    replies may come late. What a program that died had begun to send spoils the first of them, not the next."""
+    return b"laser off\r\n"
 
 
 KIND = Kind(config=IbeamConfig, create=create, off=_off)

@@ -9,16 +9,21 @@ pull-down.
 """
 
 import logging
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from drivers.errors import DeviceNotFound
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
 from drivers.transports.endpoints import EMULATED_PREFIX, resolve
 from drivers.units import Watts, format_quantity
 
 _log = logging.getLogger(__name__)
+
+BY_HAND = "by hand, W: "
+"""Begins the address that an emulating world gives to such a laser; the power that it is set to, in W, follows."""
 
 
 class TtlConfig(KindConfig):
@@ -106,9 +111,18 @@ class TtlLaser(LineLaser):
 
 
 def create(config: TtlConfig, surroundings: Surroundings) -> TtlLaser:
-    """The laser. Raises `DeviceNotFound` for an emulated port that the world does not have."""
+    """The laser. Raises `DeviceNotFound` for an emulated port without such a laser, or with one at another power."""
     if config.port is not None:
-        resolve(config.port, surroundings.ports)
+        at = resolve(config.port, surroundings.ports).address
+        found = at.removeprefix(BY_HAND)
+        if found == at:
+            raise DeviceNotFound(f"ttl laser: the one at {config.port} is not switched by hand; set world.laser to ttl")
+        if not math.isclose(float(found), config.power):
+            emulated, power = (format_quantity(value, "power") for value in (float(found), config.power))
+            raise DeviceNotFound(
+                f"ttl laser: the one at {config.port} is set to {emulated} by hand, not {power}; make laser.power and "
+                "world.ttl_power the same"
+            )
     return TtlLaser(config.power)
 
 

@@ -340,5 +340,5 @@ def laser_off(config: RigConfig) -> list[str]:
             except Exception as error:  # a driver's own fault must not keep the laser on
                 trouble.append(f"{slot}: {error}")
     if trouble:
-        raise DevicesError("\n".join([*trouble, *done]))
+        raise DevicesError("\n".join(trouble) + (f" (done: {', '.join(done)})" if done else ""))
     return done

@@ -286,6 +286,8 @@ class Acquisition:
             except BaseException as error:  # neither a failed step nor a second Ctrl-C may prevent the others
                 trouble.append(f"{name}: {str(error) or type(error).__name__}")
                 interrupted = interrupted or (None if isinstance(error, Exception) else error)
+                if name == "gate" and rig.laser.gate_only:
+                    trouble.append(f"laser: only that gate ends the light of {rig.laser.name}: switch it off by hand")
         if not pipeline.join_source():
             trouble.append(f"spad: {rig.spad.name} did not return within {JOIN_S:g} s of being stopped; unplug it")
         for line in trouble:

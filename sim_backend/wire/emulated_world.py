@@ -19,6 +19,7 @@ from pydantic import Field
 
 from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
+from drivers.lasers.ttl import BY_HAND
 from drivers.registry import Kind, Surroundings
 from drivers.transports.endpoints import Endpoint
 from drivers.units import Watts
@@ -76,7 +77,7 @@ class EmulatedWorldConfig(WorldConfig):
     laser: Literal["cobolt", "ibeam", "obis", "ttl"] = "cobolt"
     """The laser that answers at emulated:laser; `ttl` only shines."""
     ttl_power: Annotated[Watts, Field(gt=0)] = 0.05
-    """Power at which a laser of kind `ttl` was set by hand."""
+    """Power at which a laser of kind `ttl` was set by hand; `laser.power` must be the same."""
     scanner: Literal["helios", "etherdream", "nidaq"] = "helios"
     """The scanner that answers at emulated:scanner."""
     sync: Literal["prawndo", "pulsestreamer", "teensy"] = "prawndo"
@@ -114,7 +115,7 @@ class EmulatedWorld(SimulatedWorld):
         on_bus = Endpoint("usb", usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
         self.spad = SpbUsbModel(self._frames, SpbUsbBoard(width, rows, paced=True, fifo_frames=KEPT_FRAMES))
         self.spad_plug = bus.plug(self.spad)
-        self.ports: dict[str, Endpoint] = {"laser": Endpoint("by hand"), "scanner": on_bus, "spad": on_bus}
+        self.ports: dict[str, Endpoint] = {"scanner": on_bus, "spad": on_bus}
         try:
             if config.spad == "spad512s":
                 program = self._start(TcpServer(Spad512sModel(self._frames.whole, paced=True), clock=clock))
@@ -149,6 +150,7 @@ class EmulatedWorld(SimulatedWorld):
             self.laser: Any = None
             if config.laser == "ttl":
                 self._emission = [(-np.inf, config.ttl_power)]
+                self.ports["laser"] = Endpoint(f"{BY_HAND}{config.ttl_power}")
             else:
                 self.laser = LASERS[config.laser](on_emission=self._note_emission)
                 self.laser_wire = self._start(SerialServer(self.laser, clock=clock))

@@ -13,17 +13,20 @@ from typing import Any
 from drivers.clock import VirtualClock
 from drivers.guard import Guard
 from drivers.interfaces import SyncSource
+from drivers.lasers.ibeam import IbeamConfig
 from drivers.lasers.obis import ObisConfig
+from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import DacModel, HeliosModel
+from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
 from tests.wire.lasercube import LaserCubeModel
-from tests.wire.lasers import eventually, open_cobolt, open_obis, wire
+from tests.wire.lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
 from tests.wire.scanners import opened
 from tests.wire.syncs import Board, board
 
@@ -47,12 +50,20 @@ def obis(folder: Path, *, channel: int | None = None, **settings: Any) -> Iterat
 
 
 @contextmanager
-def guarded_obis(folder: Path) -> Iterator[LaserCase]:
-    model = ObisModel(cdrh_delay_s=0.2)
-    config = ObisConfig.model_validate({"port": "emulated:laser", "max_power": "80 mW"})
-    clock = VirtualClock()
-    with SerialServer(model, clock=clock) as server, Guard(laser=config, ports={"laser": server.endpoint}) as guard:
-        yield LaserCase(guard.laser, clock, lambda: model.emitting)
+def ibeam(folder: Path, **settings: Any) -> Iterator[LaserCase]:
+    model = IbeamModel(**settings)
+    with wire(model) as (_, surroundings), open_ibeam(surroundings) as device:
+        yield LaserCase(device, surroundings.clock, lambda: model.emitting)
+
+
+@contextmanager
+def guarded(folder: Path, model: Any, config: type[SerialLaserConfig]) -> Iterator[LaserCase]:
+    made, clock = model(), VirtualClock()
+    with (
+        SerialServer(made, clock=clock) as server,
+        Guard(laser=config.model_validate(USUAL), ports={"laser": server.endpoint}) as guard,
+    ):
+        yield LaserCase(guard.laser, clock, lambda: made.emitting)
 
 
 @contextmanager
@@ -120,7 +131,12 @@ LASERS: dict[str, Factory] = {
     "cobolt 06-01": partial(cobolt, family="06-01"),
     "obis without handshake, cold": partial(obis, handshake=False, warm_up_s=3.0),
     "obis behind a remote": partial(obis, channel=2),
-    "obis, guarded": guarded_obis,
+    "obis, guarded": partial(guarded, model=partial(ObisModel, cdrh_delay_s=0.2), config=ObisConfig),
+    "ibeam": ibeam,
+    "ibeam, talkative, 5 channels": partial(
+        ibeam, talk="gabby", powers_w=dict.fromkeys(range(1, 6), 0.01), enabled={1, 3, 4}, disabled_shine=True
+    ),
+    "ibeam, guarded": partial(guarded, model=IbeamModel, config=IbeamConfig),
     "ttl": ttl,
     "ttl, guarded": guarded_ttl,
 }

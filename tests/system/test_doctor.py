@@ -67,6 +67,22 @@ def test_it_shows_who_is_there_and_how_they_are(examine: Examine) -> None:
     assert rate_hz == pytest.approx(12_500 / 10, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("laser", "words"),
+    [
+        ({"kind": "ibeam"}, ("iBeam smart iBEAM-SMART-640", "interlock not known", "30.2 C")),
+        ({"kind": "ttl", "power": "50 mW"}, ("ttl laser at 50 mW", "only its gate ends its light", "off by hand")),
+    ],
+)
+def test_a_laser_that_tells_less_is_not_said_to_be_safe(
+    laser: dict[str, str], words: tuple[str, ...], examine: Examine
+) -> None:
+    found = examine(world={"laser": laser["kind"]}, laser=laser)["laser"]
+    assert found.ok
+    assert all(word in found.text for word in words), found
+    assert "interlock closed" not in found.text
+
+
 def test_a_laser_that_could_not_be_armed_and_markers_that_do_not_come(
     examine: Examine, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 from drivers.clock import Clock, VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import LineLaser
-from drivers.lasers import cobolt, obis
+from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
 from sim_backend.wire.serve.serial import SerialModel
@@ -22,6 +22,7 @@ PATIENCE_S = 60.0
 """Longest wait for what comes for sure, however much else the machine has to do."""
 QUICK_COBOLT = LineTiming(gap_s=0.1, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 """Replies come within milliseconds of the wire's virtual time."""
+QUICK_IBEAM = LineTiming(gap_s=0.05, reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 QUICK_OBIS = LineTiming(reply_s=0.15, quiet_s=0.02, drain_s=0.1)
 
 
@@ -40,6 +41,10 @@ USUAL = {"port": "emulated:laser", "max_power": "80 mW"}
 
 def open_cobolt(surroundings: Surroundings, **config: Any) -> LineLaser:
     return cobolt.create(cobolt.CoboltConfig.model_validate(USUAL | config), surroundings, QUICK_COBOLT)
+
+
+def open_ibeam(surroundings: Surroundings, **config: Any) -> LineLaser:
+    return ibeam.create(ibeam.IbeamConfig.model_validate(USUAL | config), surroundings, QUICK_IBEAM)
 
 
 def open_obis(surroundings: Surroundings, **config: Any) -> LineLaser:

@@ -35,6 +35,7 @@ from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 
 WIDTH, HEIGHT = 64, 16
 COLUMNS, EXPOSURES = 20, 12
+POWER = "20 mW"
 STILL_S = 1e-3
 """A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
 STEP_S = 5e-5
@@ -188,13 +189,14 @@ def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -
                 "geometry": str(geometry),
                 "scene": "street-clear",
                 "laser": laser,
+                "ttl_power": POWER,
                 "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
             }
         )
         with closing(EmulatedWorld(settings, Surroundings(SystemClock(), None, 1), bus)) as world:
             if laser == "cobolt":
                 world.laser.warm_up_s = 0.2
-            else:
+            elif laser == "obis":
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
             (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence)))
@@ -229,6 +231,8 @@ def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
     # A machine that has much else to do may be late.
     content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}
     content["laser"]["kind"] = laser
-    content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": "20 mW"}
+    if laser == "ttl":
+        content["laser"] = {"kind": laser, "power": POWER, "max_power": "50 mW"}  # a real one has no port
+    content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": POWER}
     content["estimate"]["threads"] = 1
     return content

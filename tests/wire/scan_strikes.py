@@ -16,6 +16,8 @@ GONE_S = 0.1
 """Light has to be gone after this, at the 99.9th percentile..."""
 NEVER_S = 0.5
 """...and after this always."""
+BY_HAND = "ttl"
+"""The laser whose emission no program ends."""
 EMISSION_S = 1.0
 """Emission is off after this where the laser's port still answers."""
 MAPS = 40
@@ -23,11 +25,13 @@ MAPS = 40
 LONG_MAPS = 2000
 """Of one that is struck in its midst however slow the machine is."""
 DARK_S = 0.5
+HUNG_S = 20.0
+"""Until a laser that does not answer is given up, at most; the gate works on all the time."""
 LONG_S = 1.1
 """From the first light to beyond the end of the scan."""
 FIRST_FRAME_S = GuardLimits().first_frame_s + GONE_S
 """Light is gone after this where the SPAD fell silent before its first frame was taken."""
-OPENING_S = {"obis": 1.2, "cobolt": 7.0}
+OPENING_S = {"obis": 1.2, "cobolt": 7.0, "ibeam": 4.5, "ttl": 1.0}
 """From the start to the first light, about."""
 FULL_BYTES = 16_384
 _END_S = 60.0
@@ -98,6 +102,13 @@ SCAN_STRIKES = {
     "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
     "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
+    "laser's firmware hangs": ScanStrike(
+        lambda bench: bench.world.laser_wire.hang(),
+        own_end=True,
+        laser_answers=False,
+        light_s=HUNG_S,
+        emission_s=HUNG_S,
+    ),
     "interlock opened": ScanStrike(_open_interlock, own_end=True),
     "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
 }
@@ -145,7 +156,7 @@ def strike_scan(
             made.blow(bench)
         if measured:
             time.sleep(made.emission_s + 0.05)
-        elif made.laser_answers:
+        elif made.laser_answers and laser != BY_HAND:
             eventually(lambda: bench.dark_s(at_s) < math.inf)
         else:
             eventually(lambda: not bench.light(time.monotonic() - DARK_S))

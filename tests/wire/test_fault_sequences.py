@@ -12,6 +12,7 @@ from tests.campaigns.outcomes import campaign
     ("driver", "sequences", "workers", "right", "least_right"),
     [
         ("cobolt", 50, 8, "done", 100),
+        ("ibeam", 50, 8, "done", 100),
         ("obis", 50, 8, "done", 100),
         ("prawndo", 50, 5, "done", 100),
         ("helios", 60, 1, "complete", 1),

@@ -16,12 +16,13 @@ import pytest
 from drivers.clock import VirtualClock
 from drivers.errors import LimitExceeded, WrongState
 from drivers.interfaces import LineLaser
-from drivers.lasers import cobolt, obis
+from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.spads import spad512s, spb_usb
 from drivers.sync import prawndo
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
+from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
@@ -47,6 +48,8 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
     with ExitStack() as stack:
         laser, sync = CoboltModel(warm_up_s=0.0), stack.enter_context(board())
         _, at_laser = stack.enter_context(wire(laser))
+        second = IbeamModel()
+        _, at_ibeam = stack.enter_context(wire(second))
         ids = replace(sync.server.endpoint, usb_ids=(0x2E8A, 0x000A))
         spad = stack.enter_context(TcpServer(Spad512sModel(frames)))
         clock = VirtualClock()
@@ -54,6 +57,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         bus.plug(helios)
         places = {
             cobolt: replace(at_laser, ports={"laser": at_laser.ports["laser"]}),
+            ibeam: at_ibeam,
             prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
         }
@@ -62,7 +66,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
         monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
         monkeypatch.setattr(time, "sleep", clock.sleep)
-        yield {"laser": laser, "sync": sync.model, "scanner": helios}
+        yield {"laser": laser, "ibeam": second, "sync": sync.model, "scanner": helios}
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.split("import ")[1].split()[0])
@@ -75,11 +79,13 @@ def test_the_cells_of_the_page_run_as_they_are_written(
     exec(compile(cell, str(PAGE), "exec"), {})
     assert capsys.readouterr().out
     assert not lab["laser"].emitting
+    assert not lab["ibeam"].emitting
     assert lab["sync"].status == 0 or lab["sync"].status == 5
 
 
 MAKES: list[tuple[type[LineLaser], Callable[[], Any]]] = [
     (cobolt.CoboltLaser, lambda: CoboltModel(warm_up_s=0.0)),
+    (ibeam.IbeamLaser, IbeamModel),
     (obis.ObisLaser, lambda: ObisModel(warm_up_s=0.0, cdrh_delay_s=0.0)),
 ]
 
@@ -156,7 +162,12 @@ def test_a_laser_is_opened_and_asked_by_itself_and_closed_for_good(
     with wire(make()) as (_, surroundings):
         with kind.open("emulated:laser", max_power_w=0.03, surroundings=surroundings) as laser:
             assert laser.limits.max_power_w == pytest.approx(0.03)
-            assert laser.ask("ilk?" if kind is cobolt.CoboltLaser else "SYST:LOCK?") in ("0", "ON", "OK")
+            asked = {
+                cobolt.CoboltLaser: ("ilk?", "0"),
+                ibeam.IbeamLaser: ("sta la", "OFF"),
+                obis.ObisLaser: ("SYST:LOCK?", "ON"),
+            }
+            assert laser.ask(asked[kind][0]) == asked[kind][1]
             assert laser.ask("nonsense?")  # a refusal is an answer
         with pytest.raises(WrongState):
             laser.ask("?")

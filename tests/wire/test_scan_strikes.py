@@ -10,7 +10,7 @@ import pytest
 
 from tests.wire.lasers import PATIENCE_S
 from tests.wire.scan_rig import Applications, ScanFailedError, scan_bench
-from tests.wire.scan_strikes import SCAN_STRIKES, strike_scan, trouble_of
+from tests.wire.scan_strikes import BY_HAND, SCAN_STRIKES, strike_scan, trouble_of
 from tests.wire.usb.umockdev import missing
 
 SHARES = {name: 0.05 + 0.3 * i / len(SCAN_STRIKES) for i, name in enumerate(SCAN_STRIKES)}
@@ -39,7 +39,15 @@ def test_a_scan_that_nobody_strikes_shines_on_a_moving_mirror_only(scans: Applic
         assert bench.light_at_rest(bench.started_s) == []
 
 
-@pytest.mark.parametrize(("name", "laser"), [*((name, "obis") for name in SCAN_STRIKES), ("guard killed", "cobolt")])
+OTHERS = {
+    "cobolt": ("guard killed",),
+    "ibeam": ("guard killed", "laser unplugged", "laser's firmware hangs", "interlock opened"),
+    BY_HAND: ("application killed", "guard killed", "gate's firmware hangs", "gate unplugged"),
+}
+STRIKES = [*((name, "obis") for name in SCAN_STRIKES), *((name, laser) for laser in OTHERS for name in OTHERS[laser])]
+
+
+@pytest.mark.parametrize(("name", "laser"), STRIKES)
 def test_a_struck_scan_goes_dark_and_says_so(name: str, laser: str, scans: Applications) -> None:
     for attempt in range(SCANS_TRIED):
         try:

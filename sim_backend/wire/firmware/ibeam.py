@@ -1,11 +1,11 @@
 """Model of a Toptica iBeam smart laser's firmware: prompt, echo and talk, two channels, digital input, interlock.
 
-Each fact has its public source in the table of docs/reference/hardware.md. Words may be shortened (`la on`), commands
-end with CR, and an LF is ignored. An answer is CRLF, the lines, then `[OK]` and CRLF, or `CMD> ` without a line end
-while the prompt is on, as after power-up. The model has the traps of the real laser: powers are in mW unless `micro`
-follows, channel 1 is a bias that the digital input does not switch, `laser on` enables the default channel again,
-`disable ext` lets channel 2 shine, channel 2 cannot be switched while `ext` is enabled, errors end with `[OK]` too,
-`%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
+Each fact has its public source in the table of docs/reference/devices/ibeam.md. Words may be shortened (`la on`),
+commands end with CR, and an LF is ignored. An answer is CRLF, the lines, then `[OK]` and CRLF, or `CMD> ` without a
+line end while the prompt is on, as after power-up. The model has the traps of the real laser: powers are in mW unless
+`micro` follows, channel 1 is a bias that the digital input does not switch, `laser on` enables the default channel
+again, `disable ext` lets channel 2 shine, channel 2 cannot be switched while `ext` is enabled, errors end with `[OK]`
+too, `%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
 
 The manual is not public. Made up here: numbers and texts of errors and of the lines of `talk gabby`, the text after a
 start, tables beyond the lines that clients look for, that an open interlock or key switches off and refuses `laser on`,
@@ -49,17 +49,19 @@ _NUMBER = re.compile(r"\d+(\.\d*)?")
 class IbeamModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change. default_channel: the one that `laser on`
-    enables; None: it enables none. pulse_board: whether `ext` means the digital input; without it `ext` means an analog
-    input, where 0 V is full power. scaled: whether `SCALED` comes before power, current and temperature. lag_gap_s: a
-    command that comes sooner than this after the last one makes all replies late by one, until `reset system`.
-    on_delay_s: time from `laser on` to the light, while the status says ON.
+    on_emission(emits, now_s) is called whenever the light behind an open or closed gate changes. default_channel: the
+    one that `laser on` enables; None: it enables none. disabled_shine: whether channels shine that are not enabled, as
+    users say of some. pulse_board: whether `ext` means the digital input; without it `ext` means an analog input, where
+    0 V is full power. scaled: whether `SCALED` comes before power, current and temperature. lag_gap_s: a command that
+    comes sooner than this after the last one makes all replies late by one, until `reset system`. on_delay_s: time from
+    `laser on` to the light, while the status says ON.
     """
 
     serial: str = "iBEAM-SMART-640-S-A3-12345"
     version: str = "iBPs-001A01-05"
     max_power_w: float = 0.15
     default_channel: int | None = BIAS
+    disabled_shine: bool = False
     pulse_board: bool = True
     scaled: bool = True
     lag_gap_s: float = 0.0
@@ -91,7 +93,7 @@ class IbeamModel:
     _late: str = ""
     """Reply that waits for the next command."""
     _unasked: str = ""
-    _shown: tuple[bool, float] = (False, 0.0)
+    _shown: tuple[bool, float, float] = (False, 0.0, 0.0)
 
     @property
     def able(self) -> bool:
@@ -111,12 +113,12 @@ class IbeamModel:
     @property
     def power_w(self) -> float:
         """Power in W that comes out now; for a gated laser, the power that an open gate lets out."""
-        return self._level_w(BIAS, NORMAL)
+        return self._level_w()
 
     @property
     def closed_gate_power_w(self) -> float:
         """Power in W that comes out while the digital input is low."""
-        return self._level_w(BIAS) if self.gated else self.power_w
+        return self._level_w(NORMAL) if self.gated else self.power_w
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
         """Switch the laser on, as an earlier user may have left it."""
@@ -134,7 +136,7 @@ class IbeamModel:
         self._now_s, self.key_on, self.state_on = now_s, on, self.state_on and on
         self._tell()
 
-    def fail(self, text: str, now_s: float) -> None:
+    def set_fault(self, text: str, now_s: float) -> None:
         """Let a fatal fault switch the laser off, for as long as `fault` holds its text."""
         self._now_s, self.fault, self.state_on = now_s, text, False
         self._tell()
@@ -167,11 +169,12 @@ class IbeamModel:
         self._tell()
         return self._take_unasked().encode("ascii")
 
-    def _level_w(self, *channels: int) -> float:
-        """Sum of the levels of the enabled ones among the channels, 0 while the driver is off."""
+    def _level_w(self, without: int = 0) -> float:
+        """Sum of the levels of the enabled channels but one, 0 while the driver is off."""
         if not (self.state_on and self.able and self._now_s >= self._lit_at_s):
             return 0.0
-        return min(sum(self.powers_w[one] for one in channels if one in self.enabled), self.max_power_w)
+        shining = (self.enabled | set(self.powers_w if self.disabled_shine else ())) - {without}
+        return min(sum(self.powers_w[one] for one in shining), self.max_power_w)
 
     def _take_unasked(self) -> str:
         out, self._unasked = self._unasked, ""
@@ -294,7 +297,7 @@ class IbeamModel:
         return ""
 
     def _tell(self) -> None:
-        shown = (self.emitting, self.power_w)
+        shown = (self.emitting, self.power_w, self.closed_gate_power_w)
         if shown != self._shown:
             self._shown = shown
             if self.on_emission is not None:

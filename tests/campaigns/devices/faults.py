@@ -17,6 +17,7 @@ from tests.campaigns.outcomes import Ending, options, run
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "obis": partial(lasers.sequence, lasers.OBIS),
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
+    "ibeam": partial(lasers.sequence, lasers.IBEAM),
     "prawndo": prawndo.sequence,
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
@@ -27,6 +28,7 @@ SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
 WATCHED = {
     "obis": "longest verb, s",
     "cobolt": "longest verb, s",
+    "ibeam": "longest verb, s",
     "prawndo": "longest verb, s",
     "blanking": "largest error of a synchronised map, columns",
 }

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import cast
 
 from drivers.clock import VirtualClock
-from drivers.interfaces import LineLaser
-from drivers.lasers import cobolt, obis
+from drivers.interfaces import DeviceState, LineLaser
+from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.transports.dialogue import LineTiming
 from sim_backend.wire.firmware.cobolt import CoboltModel, Family
+from sim_backend.wire.firmware.ibeam import BIAS, NORMAL, IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from tests.campaigns.outcomes import Ending, Verbs
 from tests.wire.faults import Fault, FaultSchedule
@@ -30,12 +31,13 @@ STALL_S = 0.06
 GAP_S = 0.1
 TIMES = {"reply_s": 0.03, "quiet_s": 0.01, "drain_s": 0.05}
 
-
-Model = CoboltModel | ObisModel
+Model = CoboltModel | IbeamModel | ObisModel
 
 
 def told_power_w(model: Model) -> float:
     """The power it is set to, shining or not."""
+    if isinstance(model, IbeamModel):
+        return sum(model.powers_w.values())
     if isinstance(model, ObisModel):
         return model.set_power_w
     return model.modulation_power_w if model.mode == "modulation" else model.constant_power_w
@@ -47,6 +49,7 @@ class Subject:
 
     make: Callable[[random.Random], Model]
     open: Callable[[Model, Surroundings], LineLaser]
+    deadline_s: float = DEADLINE_S
 
 
 class Sequence:
@@ -54,7 +57,7 @@ class Sequence:
 
     def __init__(self, subject: Subject, seed: int) -> None:
         self._clock = VirtualClock()
-        self._verb = Verbs(DEADLINE_S, lambda: self._clock.now_ns() * 1e-9)
+        self._verb = Verbs(subject.deadline_s, lambda: self._clock.now_ns() * 1e-9)
         self._subject = subject
         self._rng = random.Random(seed)
         self._model = subject.make(self._rng)
@@ -91,12 +94,13 @@ class Sequence:
                 if self._verb(verb, lambda: laser.arm(power_w)):
                     assert self._model.gated, "armed, and the gate does not govern the light"
                     assert abs(told_power_w(self._model) - power_w) <= 0.011 * power_w + 5e-5, "armed at another power"
+                    assert not isinstance(self._model, IbeamModel) or not self._model.closed_gate_power_w, "leaks"
             case "pause":
                 if self._verb(verb, laser.pause):
                     self._stays_dark("paused")
             case "disarm":
                 if self._verb(verb, laser.disarm):
-                    on = self._model.state_on if isinstance(self._model, ObisModel) else self._model.on
+                    on = self._model.on if isinstance(self._model, CoboltModel) else self._model.state_on
                     assert not on, "disarmed, and on"
                     self._stays_dark("disarmed")
             case "interlock":
@@ -104,9 +108,12 @@ class Sequence:
                     self._model.open_interlock(self._clock.now_ns() * 1e-9)
                 self._verb("status", lambda: self._check_status(laser))
                 with self._server.lock:
-                    self._model.interlock_open, self._model.fault = False, 0
+                    self._model.interlock_open = False
+                    if not isinstance(self._model, IbeamModel):
+                        self._model.fault = 0
         assert told_power_w(self._model) <= LIMIT_W * 1.001, "told a power above the limit"
-        assert not self._model.forbidden, f"sent {self._model.forbidden}"
+        forbidden = None if isinstance(self._model, IbeamModel) else self._model.forbidden
+        assert not forbidden, f"sent {forbidden}"
         if self._rng.random() < 0.3:
             self._mend()
 
@@ -121,7 +128,10 @@ class Sequence:
         status = laser.status
         if Fault.CORRUPTED in self._faults.struck[before:]:
             return
-        assert status.interlock_closed != self._model.interlock_open, "the interlock is not what the status says"
+        if not isinstance(self._model, IbeamModel):  # it cannot be asked
+            assert status.interlock_closed != self._model.interlock_open, "the interlock is not what the status says"
+        elif status.armed and not status.emission and laser.state is DeviceState.RUNNING:
+            assert status.fault, "it was armed and went off, and the status says nothing"
         assert status.emission or not (emitting and self._model.emitting), (
             "it emits and the status says that it does not"
         )
@@ -190,5 +200,30 @@ def _open_obis(model: Model, surroundings: Surroundings) -> LineLaser:
     return obis.create(config, surroundings, LineTiming(**TIMES))
 
 
+def _make_ibeam(rng: random.Random) -> Model:
+    model = IbeamModel(
+        echo=rng.random() < 0.5,
+        prompt=rng.random() < 0.5,
+        talk=rng.choice(("usual", "gabby", "quiet")),
+        default_channel=rng.choice((None, BIAS, NORMAL)),
+        disabled_shine=rng.random() < 0.3,
+        powers_w=dict.fromkeys(range(1, rng.choice((3, 4, 6))), 0.01),
+        ext=rng.random() < 0.3,
+        fine=rng.random() < 0.3,
+        scaled=rng.random() < 0.5,
+        lag_gap_s=rng.choice((0.0, 0.049)),
+        on_delay_s=rng.choice((0.0, 0.0, 3.0)),
+    )
+    if rng.random() < 0.3:
+        model.shine(0.05, gated=rng.random() < 0.5)
+    return model
+
+
+def _open_ibeam(model: Model, surroundings: Surroundings) -> LineLaser:
+    config = ibeam.IbeamConfig(port="emulated:laser", max_power=f"{LIMIT_W} W")  # type: ignore[arg-type]
+    return ibeam.create(config, surroundings, LineTiming(gap_s=0.05, **TIMES))
+
+
 COBOLT = Subject(_make_cobolt, _open_cobolt)
 OBIS = Subject(_make_obis, _open_obis)
+IBEAM = Subject(_make_ibeam, _open_ibeam, deadline_s=15.0)  # arm may wait 10 s until it is on

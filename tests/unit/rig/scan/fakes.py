@@ -58,6 +58,7 @@ class FakeScanner(Device):
 
 
 class FakeLaser(Device):
+    gate_only = False
     limits = LaserLimits(0.0, 0.05)
 
     def arm(self, power_w):

@@ -21,7 +21,7 @@ from rig.scan import pipeline
 from rig.scan.run import verdict_of
 from rig.threads import RowWorkers
 from tests.unit.rig.count.streams import HEIGHT, SPAD, WIDTH, plan_of, scan, stream_of
-from tests.unit.rig.scan.fakes import PATIENCE_S, START, STOP, FakeMaker, acquisition, fake_rig
+from tests.unit.rig.scan.fakes import PATIENCE_S, START, STOP, FakeLaser, FakeMaker, acquisition, fake_rig
 
 LAG = Lag(1e-4, 2e-4)
 PLAN = plan_of(scan(), LAG)
@@ -93,6 +93,15 @@ def test_trouble_while_stopping_is_noted_on_the_error_that_led_there():
     with pytest.raises(ValueError) as caught:
         run.throw(ValueError("first"))
     assert caught.value.__notes__ == ["scanner: stuck"]
+
+
+def test_a_gate_that_does_not_obey_is_worse_where_nothing_else_ends_the_light(monkeypatch):
+    monkeypatch.setattr(FakeLaser, "gate_only", True)
+    run, _ = begun({"sync": {"abort": DeviceFault("gate reads high")}})
+    with pytest.raises(ValueError) as caught:
+        run.throw(ValueError("first"))
+    hand = "laser: only that gate ends the light of laser: switch it off by hand"
+    assert caught.value.__notes__ == ["gate: gate reads high", hand]
 
 
 def test_a_guard_that_took_the_light_ends_a_scan_whose_spad_is_silent():
