@@ -16,7 +16,7 @@ from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.wire_server import WireServer
-from tests.wire.faults import Faulty, FaultSchedule
+from tests.wire.faults import FaultSchedule, Faulty
 from tests.wire.scanners import GALVO
 
 TURN_S = 0.0005
@@ -160,10 +160,9 @@ def turning(wire: TcpWire) -> bool:
 
 
 def let_pass(wire: TcpWire, seconds: float) -> None:
-    """A thread that holds the mirror moves the clock on; where none does, it is moved."""
+    """A thread of the driver moves the clock on; where none does, it is moved."""
     ends_s = wire.now_s + seconds
-    while (left_s := ends_s - wire.now_s) > 0:
-        if wire.model.moving(wire.now_s):  # type: ignore[attr-defined]
-            time.sleep(0.001)
-        else:
-            wire._clock.sleep(left_s)
+    while (before_s := wire.now_s) < ends_s:
+        time.sleep(0.004)
+        if wire.now_s == before_s:
+            wire._clock.sleep(min(0.01, ends_s - before_s) + 1e-9)
