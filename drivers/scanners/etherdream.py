@@ -227,7 +227,7 @@ class EtherDreamRun:
         `stopping` is set.
         """
         stopped = False
-        while self._end is None or self._stream.played < self._end:
+        while self._end is None or not self._stream.is_played(self._end):
             if not stopped and stopping.is_set():
                 stopped = True
                 self.source.stop()

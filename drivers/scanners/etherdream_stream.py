@@ -115,6 +115,10 @@ class PointStream:
         free = self._capacity - (self.sent - self.played)
         return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
 
+    def is_played(self, n: int) -> bool:
+        """Whether the first n points were played, by a last reply that speaks of no other ones."""
+        return self.played >= n and not self._ahead
+
     def send(self, points: PointSlice) -> None:
         """Append points, no more than there is `room` for; without any, ask how far the board is. Raises `DeviceFault`
         if any was not played as it should.

@@ -23,6 +23,7 @@ from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, Mark
 from drivers.guard import GuardLimits
 from drivers.interfaces import MARKER_LINE, Pulse, SpadCounters
 from drivers.ring import BlockRing
+from drivers.scanners.etherdream_line import broadcasts
 from drivers.scanners.helios import HELIOS
 from drivers.scanners.lasercube import LASERCUBE
 from drivers.spads.spb_usb_setup import USB_IDS
@@ -302,12 +303,14 @@ class Attached:
 
 
 def attached() -> list[Attached]:
-    """List USB devices that a driver knows, then serial ports. Opens nothing."""
+    """List USB devices that a driver knows, Ether Dreams that are heard within 1.5 s, then serial ports. Opens nothing."""
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
         for one in attached_usb(wanted)
     ]
+    for address, heard in dict(broadcasts()).items():
+        found.append(Attached(address, f"etherdream: MAC {heard.mac}, hardware {heard.hardware}", "etherdream"))
     for port in list_ports.comports():
         serial = f", serial={port.serial_number}" if port.serial_number else ""
         found.append(Attached(port.device, f"serial port: {port.description}{serial}", None))

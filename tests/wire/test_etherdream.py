@@ -305,9 +305,9 @@ def _late(wire: TcpWire) -> None:
         wire._clock.sleep(0.5)
 
 
-def _other_client(wire: TcpWire) -> None:
+def _other_client(wire: TcpWire, n: int = 5) -> None:
     with wire.lock:
-        wire.model._ring = np.concatenate([wire.model._ring, wire.model._ring[-5:]])  # type: ignore[attr-defined]
+        wire.model._ring = np.concatenate([wire.model._ring, wire.model._ring[-n:]])  # type: ignore[attr-defined]
 
 
 FAULTS: dict[str, tuple[Callable[[Any], None], str]] = {
@@ -342,6 +342,23 @@ def test_what_ends_a_run_or_the_hold_is_a_fault_and_the_next_run_begins_at_the_c
         play(device, 1)
         assert device.status.fault is None
         assert wire.model.history.command(np.array([began_s]))[0] == CENTRE  # type: ignore[attr-defined]
+
+
+def test_a_single_point_too_many_shortly_before_the_end_is_a_fault() -> None:
+    model = Recorder()
+    with wired(model) as wire, open_etherdream(wire) as device:
+        device.load(cosine(device), 1)
+        receive = model.receive
+
+        def joined(data: bytes, now_s: float) -> None:
+            receive(data, now_s)
+            if len(model.log) == 110:
+                _other_client(wire, 1)
+
+        model.receive = joined  # type: ignore[method-assign]
+        device.start()
+        finish(device)
+        assert "lost or repeated" in str(device.status.fault)
 
 
 def test_a_lost_connection_is_told_and_a_board_that_hangs_ends_the_run_in_time() -> None:

@@ -20,8 +20,8 @@ from sim_backend.wire.serve.usb_model import STALL, AlternateSpec, Answer, Devic
 
 Array = NDArray[np.float64]
 
-JOINED_POINTS = 4096
-"""Length from which on a piece of the history is not lengthened any more."""
+JOINED_S = 0.1
+"""Duration from which on a piece of the history is not lengthened any more."""
 KEEP_S = 20.0
 """Age at which the output's history is dropped."""
 
@@ -127,7 +127,7 @@ def _joins(last: Played, played: Played) -> bool:
     """Whether two pieces can be kept as one: small ones of a long stream would be thousands to look through."""
     whole_s = len(last.command) * last.period_s
     seamless = max(abs(last.start_s + whole_s - at_s) for at_s in (last.end_s, played.start_s)) < 1e-3 * last.period_s
-    return seamless and last.period_s == played.period_s and len(last.command) < JOINED_POINTS
+    return seamless and last.period_s == played.period_s and whole_s < JOINED_S
 
 
 DAC_STEPS = 4095
