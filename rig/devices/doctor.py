@@ -303,7 +303,7 @@ class Attached:
 
 
 def attached() -> list[Attached]:
-    """List USB devices that a driver knows, Ether Dreams that are heard within 1.5 s, then serial ports. Opens nothing."""
+    """List USB devices that a driver knows, Ether Dreams that broadcast, then serial ports. Opens nothing."""
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
