@@ -14,7 +14,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 
@@ -102,7 +102,7 @@ class Broadcast:
         return cls(mac.hex(":"), *numbers)
 
 
-def broadcasts(wait_s: float = BROADCAST_S, port: int = BROADCAST_PORT) -> Iterator[tuple[str, Broadcast]]:
+def broadcasts(wait_s: float = BROADCAST_S, port: int = BROADCAST_PORT) -> Generator[tuple[str, Broadcast], None, None]:
     """The broadcasts that come within `wait_s`, each with its sender's numeric address. None do if another program
     keeps the port to itself.
     """

@@ -158,6 +158,8 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             rig.sync.program(*sync_program(plan, len(plan.legs)))
             findings.append(_plan(plan))
             findings += _frames(look(rig, plan, timing.stride), plan)
+            if (fault := rig.scanner.status.fault) is not None:
+                findings.append(Finding("scanner", False, f"ended on the way: {fault}"))
             if (most := rig.spad.health.memory_high_water_bytes) is not None:
                 findings.append(Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD"))
     except (RigError, DeviceError) as error:
