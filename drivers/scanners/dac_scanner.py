@@ -8,6 +8,7 @@ by slice. Nothing is computed in advance: a waveform of a million points repeate
 """
 
 import logging
+import math
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -130,6 +131,25 @@ class PointSource:
         if self.left:
             self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
             self._at, self._end = 0, len(self._way)
+
+
+class StartTime:
+    """Bounds of the time at which the first point was played. Each answer of a board narrows them, on the assumption
+    that no point was lost, repeated or delayed.
+    """
+
+    def __init__(self) -> None:
+        self.earliest_s, self.latest_s = -math.inf, math.inf
+        self._at_s = 0.0
+
+    def narrow(self, earliest_s: float, latest_s: float, at_s: float) -> float:
+        """Narrow the bounds by those of an answer that came at `at_s`; returns the time by which they contradict each
+        other, crystals' drift set aside. Above 0 the assumption is wrong.
+        """
+        slack_s, self._at_s = DRIFT * (at_s - self._at_s), at_s
+        self.earliest_s = max(self.earliest_s - slack_s, earliest_s)
+        self.latest_s = min(self.latest_s + slack_s, latest_s)
+        return self.earliest_s - self.latest_s
 
 
 class DacRun(Protocol):

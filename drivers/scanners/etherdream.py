@@ -1,4 +1,4 @@
-"""Scanner kind `etherdream`: a galvo behind an Ether Dream laser DAC on the network (docs/reference/hardware.md).
+"""Scanner kind `etherdream`: a galvo behind an Ether Dream laser DAC on the network.
 
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
 
@@ -10,11 +10,8 @@ of the last point, all dark, at 1 kHz, until the next run or `close`. If the hos
 connection closes. The shutter output is high while the board plays, i.e. while the mirror is held, too: it keeps no
 light in.
 
-Whether every point was played exactly once, and at its rate, shows in the replies (`etherdream_stream`).
-
-Sources: `etherdream_line`; what the outputs do: `j4cbo/j4cDAC` 12ecbe5, firmware/lib/dac.c, lightengine.c and
-network.c, common/lib/hardware.c (read for facts; no code taken). What a second generation does when its connection
-closes: `ModulaserApp/laser-dac-rs` 01321db, tests/fixtures/ether_dream/README.md.
+Whether every point was played exactly once, and at its rate, shows in the replies (`etherdream_stream`). Facts and
+sources: docs/reference/devices/etherdream.md.
 """
 
 import logging
@@ -22,14 +19,13 @@ import threading
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from drivers.clock import Clock, SystemClock, now_s
-from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault
+from drivers.errors import DeviceBusy, DeviceError, DeviceFault
 from drivers.interfaces import ScannerStatus
 from drivers.registry import Kind, Surroundings, config_of, quantity
-from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSlice, PointSource
+from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSource
 from drivers.scanners.etherdream_line import (
     CLEAR,
     EMERGENCY,
@@ -40,14 +36,13 @@ from drivers.scanners.etherdream_line import (
     READY,
     STILL_STOPPED,
     STOP,
-    BoardStatus,
-    Broadcast,
     EtherDreamLine,
+    Reply,
     listen,
 )
 from drivers.scanners.etherdream_stream import MOST_PPS, PointStream, nearest_rate
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
-from drivers.transports.endpoints import resolve
+from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
 from drivers.units import Hertz, Seconds
 
@@ -74,19 +69,17 @@ class EtherDreamConfig(GalvoConfig):
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
     """Duration of the points queued in the board: the host may be late by as much, and a stop takes as long. The
     board's buffer is the limit: 1799 points last 60 ms at 30 kHz."""
-    buffer_points: Annotated[int, Field(ge=500, le=65_535)] | None = None
-    """Points that the board's buffer holds. None: as many as it broadcasts or, if nothing is heard, 1799."""
 
 
 class EtherDreamDac:
     """An Ether Dream as a `Dac`. While it is idle, the mirror stands at the centre."""
 
-    def __init__(self, config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | None = None) -> None:
+    def __init__(self, config: EtherDreamConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> None:
         """Connect, learn who the board is, and make it idle. Raises `DeviceBusy` if it plays for somebody else."""
         self.name = "Ether Dream"
         self.config = config
         self.clock = clock
-        self._line = EtherDreamLine(self.name, address, tap)
+        self._line = EtherDreamLine(self.name, endpoint, tap)
         self._stream: PointStream | None = None
         self._holder: threading.Thread | None = None
         self._letting_go = threading.Event()
@@ -96,19 +89,16 @@ class EtherDreamDac:
             # Nothing broadcasts on a loopback interface; an emulated board must not cost the wait.
             heard = None if self._line.peer.startswith("127.") else listen(self._line.peer)
             version = self._line.version() if heard is None or heard.software >= 2 else "unnamed"
-            self._settle(self._line.ask(PING).status)
+            self._settle()
         except BaseException:
             self._line.close()
             raise
-        self._note(heard, version)
-
-    def _note(self, heard: Broadcast | None, version: str) -> None:
-        self.serial = None if heard is None else heard.mac
-        self.capacity = self.config.buffer_points or (LEAST_CAPACITY if heard is None else heard.capacity)
-        highest_hz = MOST_PPS if heard is None else heard.highest_rate_hz
-        self.highest_rate_hz = min(self.config.max_point_rate, float(highest_hz))
         self.identity = f"{self.name}, firmware {version}"
+        self.serial = None if heard is None else heard.mac
+        self.capacity = LEAST_CAPACITY if heard is None else heard.capacity
+        self.highest_rate_hz = config.max_point_rate
         if heard is not None:
+            self.highest_rate_hz = min(config.max_point_rate, float(heard.highest_rate_hz))
             self.identity += f", MAC {heard.mac}, hardware {heard.hardware}, software {heard.software}"
             if heard.hardware not in _HARDWARE_KNOWN:
                 _log.warning("%s: the point clock of hardware %d is not known", self.name, heard.hardware)
@@ -131,17 +121,11 @@ class EtherDreamDac:
             self._stream.ping()
 
     def halt(self) -> float:
-        """Stop the board by its emergency stop, and clear that again; returns 0, the centre, to which the mirror jumps.
-        Connects again if the connection was lost.
-        """
+        """Stop the board by its emergency stop, and clear that again; returns 0, the centre, to which the mirror
+        jumps."""
         self._let_go()
         self._stream = None
-        self._line.connect_again()
-        try:
-            self._line.tell(EMERGENCY)
-        except DeviceDisconnected:  # it may have been lost unnoticed
-            self._line.connect_again()
-            self._line.tell(EMERGENCY)
+        self._line.tell(EMERGENCY)
         self._clear()
         return 0.0
 
@@ -149,9 +133,7 @@ class EtherDreamDac:
         """Stop holding the mirror and return the stream that still holds it for `HOLD_S`; a prepared one if the board
         is idle. Raises the error that ended the holding, if one did.
         """
-        fault = self._let_go()
-        if fault is not None:
-            self._stream = None
+        if (fault := self._let_go()) is not None:
             raise fault
         if self._stream is None:
             self._stream = PointStream(self._line, self.name, self.config.axis, self.capacity, self.clock)
@@ -169,7 +151,7 @@ class EtherDreamDac:
         was."""
         try:
             self._let_go()
-            if self._line.ask(PING).status.playback != IDLE:
+            if self._line.ask(PING).playback != IDLE:
                 self._line.tell(STOP)
         finally:
             self._line.close()
@@ -186,47 +168,35 @@ class EtherDreamDac:
     def _hold(self, stream: PointStream, command: float, letting_go: threading.Event) -> None:
         try:
             while not letting_go.is_set():
-                send_held(stream, command)
+                stream.hold(command)
                 self.clock.sleep(_HOLD_POLL_S)
         except Exception as error:
             self._fault = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
             _log.error("%s", error)
 
-    def _settle(self, status: BoardStatus) -> None:
+    def _settle(self) -> None:
         """Make the board idle and ready. What an earlier program left in its buffer is played to its end."""
-        if status.source != 0:
-            raise DeviceBusy(
-                f"{self.name}: plays from its own source {status.source}; select the network as its source"
-            )
         end_s = now_s(self.clock) + LEAST_CAPACITY / HOLD_PPS + PATIENCE_S
-        while status.playback == PLAYING:
-            if now_s(self.clock) > end_s:
-                raise DeviceBusy(f"{self.name}: plays for another client; end that one")
+        while (reply := self._line.ask(PING)).playback == PLAYING and reply.source == 0 and now_s(self.clock) < end_s:
             self.clock.sleep(_HOLD_POLL_S)
-            status = self._line.ask(PING).status
-        if status.playback == PREPARED:
-            status = self._line.tell(STOP)
-        if status.light_engine != READY:
+        if reply.source != 0:
+            raise DeviceBusy(f"{self.name}: plays from its own source {reply.source}; select the network as its source")
+        if reply.playback == PLAYING:
+            raise DeviceBusy(f"{self.name}: plays for another client; end that one")
+        if reply.playback == PREPARED:
+            self._line.tell(STOP)
+        if reply.light_engine != READY:
             _log.warning("%s: found in emergency stop or with its link just lost; clearing that", self.name)
             self._clear()
 
     def _clear(self) -> None:
         """Leave the emergency stop. Raises `DeviceFault` if its cause persists."""
-        reply = self._line.ask(CLEAR)
-        if reply.code == STILL_STOPPED or reply.status.light_engine != READY or reply.status.playback != IDLE:
+        reply: Reply = self._line.ask(CLEAR)
+        if reply.code == STILL_STOPPED or reply.light_engine != READY or reply.playback != IDLE:
             raise DeviceFault(
-                f"{self.name}: stays in emergency stop (state {reply.status.light_engine}); release its stop input, "
-                "then start again"
+                f"{self.name}: stays in emergency stop (state {reply.light_engine}); release its stop input, then "
+                "start again"
             )
-
-
-def send_held(stream: PointStream, command: float) -> None:
-    """Send copies of the point at which the mirror rests, all dark; at least ask how far the board is."""
-    n = stream.room
-    if n:
-        stream.send(PointSlice(np.full(n, command), np.zeros(n, np.uint8), np.zeros(n, bool)))
-    else:
-        stream.ping()
 
 
 class EtherDreamRun:
@@ -257,7 +227,7 @@ class EtherDreamRun:
         `stopping` is set.
         """
         stopped = False
-        while self._end is None or self._stream.played < self._end:
+        while self._end is None or not self._stream.is_played(self._end):
             if not stopped and stopping.is_set():
                 stopped = True
                 self.source.stop()
@@ -267,15 +237,13 @@ class EtherDreamRun:
 
     def _pump(self) -> None:
         """Send what there is room for: points of the run, then those that hold the mirror."""
-        if self.source.left and self._stream.room:
+        if self.source.left:
             self._stream.send(self.source.take(self._stream.room))
-        elif self.source.left:
-            self._stream.ping()
         if not self.source.left:
             if self._end is None:
                 self._end = self._stream.sent
                 self._stream.change_rate(Fraction(HOLD_PPS), round(HOLD_S * HOLD_PPS))
-            send_held(self._stream, self.source.last)
+            self._stream.hold(self.source.last)
 
 
 class EtherDream(DacScanner):
@@ -297,9 +265,9 @@ class EtherDream(DacScanner):
         second.
 
         port: "HOST" or "HOST:PORT". max_point_rate_hz, buffer_s: the most points per second; the points queued in the
-        board. settings: axis, max_step, rms_duty, command_range, park, buffer_points, as in `EtherDreamConfig`. clock:
-        for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board
-        cannot be opened.
+        board. settings: axis, max_step, rms_duty, command_range, park, as in `EtherDreamConfig`. clock: for
+        emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board cannot
+        be opened.
         """
         config = config_of(
             EtherDreamConfig,
@@ -310,7 +278,7 @@ class EtherDream(DacScanner):
             buffer=quantity("buffer_s", buffer_s, "time"),
             **settings,
         )
-        return _opened(config, port, clock or SystemClock())
+        return _opened(config, Endpoint(port), clock or SystemClock())
 
     def _do_status(self) -> ScannerStatus:
         try:
@@ -320,8 +288,8 @@ class EtherDream(DacScanner):
             return super()._do_status()
 
 
-def _opened(config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | None = None) -> EtherDream:
-    dac = EtherDreamDac(config, address, clock, tap)
+def _opened(config: EtherDreamConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> EtherDream:
+    dac = EtherDreamDac(config, endpoint, clock, tap)
     try:
         return EtherDream(dac, config)
     except BaseException:
@@ -331,8 +299,7 @@ def _opened(config: EtherDreamConfig, address: str, clock: Clock, tap: Tap | Non
 
 def create(config: EtherDreamConfig, surroundings: Surroundings) -> EtherDream:
     """Open the Ether Dream at the config's port."""
-    address = resolve(config.port, surroundings.ports).address
-    return _opened(config, address, surroundings.clock, surroundings.tap)
+    return _opened(config, resolve(config.port, surroundings.ports), surroundings.clock, surroundings.tap)
 
 
 KIND = Kind(config=EtherDreamConfig, create=create)

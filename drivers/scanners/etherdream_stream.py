@@ -1,4 +1,4 @@
-"""The points of an Ether Dream: their bytes, their rates, and whether all were played (docs/reference/hardware.md).
+"""The points of an Ether Dream: their bytes, their rates, and whether all were played.
 
 Every reply has the number of points in the buffer and of those played. Their sum must be the number sent: else a point
 was lost or repeated, or another client sends points too. Firmware reads the two numbers one after the other, so the
@@ -8,10 +8,7 @@ the first point at a rate, and the bounds must not contradict each other. Else `
 Rates change without a pause: `q` queues a rate, and bit 15 of a point's control word makes it that point's rate. A
 point takes floor(24e6 / rate) cycles of 24 MHz: the firmware writes that quotient to the match register of an LPC1758's
 PWM, whose counter starts at 1. The clock of other generations is not public. An Ether Dream 2 that was told 30 kHz was
-measured at 29 997 Hz, with an uncertainty of 3 Hz.
-
-Sources: `etherdream_line`; `j4cbo/j4cDAC` 12ecbe5, firmware/lib/dac.c, dac_asm.s and transform.c (read for facts; no
-code taken); counter of the PWM: `mbed-ce/mbed-os` 6bc4577, targets/TARGET_NXP/TARGET_LPC176X/pwmout_api.c.
+measured at 29 997 Hz, with an uncertainty of 3 Hz. Sources: docs/reference/devices/etherdream.md.
 """
 
 import math
@@ -22,7 +19,7 @@ import numpy as np
 from drivers.clock import Clock, now_s
 from drivers.errors import DeviceFault
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.scanners.dac_scanner import DRIFT, PATIENCE_S, PointSlice
+from drivers.scanners.dac_scanner import PATIENCE_S, PointSlice, StartTime
 from drivers.scanners.etherdream_line import (
     ACCEPTED,
     BY_EMERGENCY,
@@ -32,7 +29,6 @@ from drivers.scanners.etherdream_line import (
     PREPARED,
     STOPPED,
     UNDERFLOW,
-    BoardStatus,
     EtherDreamLine,
     Reply,
     begin,
@@ -97,9 +93,9 @@ class PointStream:
         self._began = self._turns = False
         self._from = self._most = self._pps = self._first_pps = self._ahead = 0
         self._rate_hz = 1.0
-        self._start_s = (-math.inf, math.inf)
-        """Earliest and latest time at which the first point at the present rate can have been played."""
-        self._asked_s = self._moved_s = 0.0
+        self._start = StartTime()
+        """That of the first point at the present rate."""
+        self._moved_s = 0.0
         line.tell(PREPARE)
 
     def change_rate(self, clock_hz: Fraction, most: int) -> None:
@@ -110,7 +106,7 @@ class PointStream:
             self._line.tell(queue_rate(pps))
         self._from, self._most, self._pps, self._rate_hz = self.sent, most, pps, float(clock_hz)
         self._first_pps = self._first_pps or pps
-        self._start_s = (-math.inf, math.inf)
+        self._start = StartTime()
 
     @property
     def room(self) -> int:
@@ -119,11 +115,26 @@ class PointStream:
         free = self._capacity - (self.sent - self.played)
         return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
 
+    def is_played(self, n: int) -> bool:
+        """Whether the first n points were played, by a last reply that speaks of no other ones."""
+        return self.played >= n and not self._ahead
+
     def send(self, points: PointSlice) -> None:
-        """Append points, no more than there is `room` for. Raises `DeviceFault` if any was not played as it should."""
+        """Append points, no more than there is `room` for; without any, ask how far the board is. Raises `DeviceFault`
+        if any was not played as it should.
+        """
         n = len(points)
+        if not n:
+            self.ping()
+            return
         self._exchange(data(encode(points, self._axis, rate_change=self._turns), n), n)
         self._turns = False
+
+    def hold(self, command: float) -> None:
+        """Send as many copies as there is `room` for of the point at which the mirror rests, all dark. Raises as
+        `send`."""
+        n = self.room
+        self.send(PointSlice(np.full(n, command), np.zeros(n, np.uint8), np.zeros(n, bool)))
 
     def begin(self) -> None:
         """Start to play. Raises as `send`."""
@@ -143,17 +154,16 @@ class PointStream:
             self._check(reply, asked_s, now_s(self._clock))
 
     def _check(self, reply: Reply, asked_s: float, answered_s: float) -> None:
-        status = reply.status
-        if status.playback != (PLAYING if self._began else PREPARED):
-            raise DeviceFault(f"{self._name}: {_why(status)}")
+        if reply.playback != (PLAYING if self._began else PREPARED):
+            raise DeviceFault(f"{self._name}: {_why(reply)}")
         if reply.code != ACCEPTED:
             raise DeviceFault(f"{self._name}: refused points with {reply.code!r}; is another client sending, too?")
-        played = self.sent - status.fullness
-        ahead = (status.count - played) % 2**32
+        played = self.sent - reply.fullness
+        ahead = (reply.count - played) % 2**32
         self._ahead = self._ahead + 1 if ahead else 0
         if ahead > 1 or self._ahead > _MOST_AHEAD:
             raise DeviceFault(
-                f"{self._name}: of {self.sent} points sent, {status.fullness} are queued and {status.count} were "
+                f"{self._name}: of {self.sent} points sent, {reply.fullness} are queued and {reply.count} were "
                 "played: points were lost or repeated; end its other clients, then start again"
             )
         if played > self.played:
@@ -162,33 +172,27 @@ class PointStream:
             raise DeviceFault(f"{self._name}: plays no points for {PATIENCE_S:g} s; power-cycle it")
         self.played = played
         if played > self._from + 1:  # the timer takes a new rate over one point after the one that asks for it
-            self._check_rate(status, asked_s, answered_s)
+            self._check_rate(reply.rate_hz, asked_s, answered_s)
 
-    def _check_rate(self, status: BoardStatus, asked_s: float, answered_s: float) -> None:
+    def _check_rate(self, said_hz: int, asked_s: float, answered_s: float) -> None:
         """Check the rate that the board says and, once some points were played at it, the one at which it plays."""
         n = self.played - self._from
-        slack_s = DRIFT * (answered_s - self._asked_s)
-        self._asked_s = answered_s
-        earliest_s = max(self._start_s[0] - slack_s, asked_s - n / self._rate_hz)
-        latest_s = min(self._start_s[1] + slack_s, answered_s - (n - 1) / self._rate_hz)
-        if status.rate_hz != self._pps:
+        off_s = self._start.narrow(asked_s - n / self._rate_hz, answered_s - (n - 1) / self._rate_hz, answered_s)
+        if said_hz != self._pps:
+            raise DeviceFault(f"{self._name}: plays at {said_hz} Hz instead of {self._pps} Hz; end its other clients")
+        if off_s > _TOLERANCE_S:
             raise DeviceFault(
-                f"{self._name}: plays at {status.rate_hz} Hz instead of {self._pps} Hz; end its other clients"
+                f"{self._name}: after {n} points at {self._pps} Hz it is {1e3 * off_s:.1f} ms off; its clock is not "
+                "the expected one: choose another DAC"
             )
-        if earliest_s - latest_s > _TOLERANCE_S:
-            raise DeviceFault(
-                f"{self._name}: after {n} points at {self._pps} Hz it is {1e3 * (earliest_s - latest_s):.1f} ms off; "
-                "its clock is not the expected one: choose another DAC"
-            )
-        self._start_s = (earliest_s, latest_s)
 
 
-def _why(status: BoardStatus) -> str:
+def _why(reply: Reply) -> str:
     """The reason for which the board does not play, and the next step."""
-    if status.light_engine == STOPPED or status.flags & BY_EMERGENCY:
+    if reply.light_engine == STOPPED or reply.flags & BY_EMERGENCY:
         why = "an emergency stop or a lost Ethernet link ended playback; find its cause, then start again"
-    elif status.flags & UNDERFLOW:
+    elif reply.flags & UNDERFLOW:
         why = "the points ran dry; lengthen buffer or unload host and network"
     else:
-        why = f"playback was stopped from elsewhere (state {status.playback}); end the board's other clients"
+        why = f"playback was stopped from elsewhere (state {reply.playback}); end the board's other clients"
     return f"dark, and the mirror has jumped to the centre: {why}"

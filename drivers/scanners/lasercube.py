@@ -47,6 +47,7 @@ from drivers.scanners.dac_scanner import (
     DacScanner,
     PointSlice,
     PointSource,
+    StartTime,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.transports.endpoints import Endpoint, resolve
@@ -239,15 +240,12 @@ class LaserCubeRun:
         self._waiting = b""
         """Samples that do not fill a transfer yet."""
         self._sent = 0
-        self._start_s = (-np.inf, np.inf)
-        """Earliest and latest time at which the first sample can have been played."""
-        self._asked_s = 0.0
+        self._start = StartTime()
 
     def begin(self) -> None:
         """Send copies of the first point, which play at once, then points until the buffer is full."""
         self._link.set_rate(self._rate_hz)
         self._link.enable(True)
-        self._asked_s = now_s(self._link.clock)
         self._send(self.source.take(self._hold))
         self._send(self.source.take(self._room(self._queued())))
 
@@ -302,7 +300,7 @@ class LaserCubeRun:
         self._waiting += encode(points, self._axis, markers=self._markers)
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])
-        empty_s = min(self._start_s) + self._sent / self._rate_hz
+        empty_s = min(self._start.earliest_s, self._start.latest_s) + self._sent / self._rate_hz
         if whole and np.isfinite(empty_s) and now_s(self._link.clock) > empty_s:
             self._raise_dry()
         self._waiting = self._waiting[whole:]
@@ -319,16 +317,12 @@ class LaserCubeRun:
         if queued == 0:
             self._raise_dry()
         played_s = (self._sent - queued) / self._rate_hz
-        slack_s = DRIFT * (after_s - self._asked_s)
-        self._asked_s = after_s
-        earliest_s = max(self._start_s[0] - slack_s, before_s - played_s)
-        latest_s = min(self._start_s[1] + slack_s, after_s - played_s)
-        if earliest_s - latest_s > _TOLERANCE_POINTS / self._rate_hz:
+        off_points = self._start.narrow(before_s - played_s, after_s - played_s, after_s) * self._rate_hz
+        if off_points > _TOLERANCE_POINTS:
             raise DeviceFault(
-                f"{self._link.name}: {(earliest_s - latest_s) * self._rate_hz:.0f} points were lost or played late; "
-                "check the cable, then start again"
+                f"{self._link.name}: {off_points:.0f} points were lost or played late; check the cable, "
+                "then start again"
             )
-        self._start_s = (earliest_s, latest_s)
         return queued
 
 

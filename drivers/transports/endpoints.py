@@ -24,6 +24,8 @@ class Endpoint:
     serial_port: Callable[[], Any] | None = None
     """Function that opens an emulated serial port: an object like `serial.Serial` that waits on its own `clock`. None:
     pyserial opens the address."""
+    tcp_stream: Callable[[], Any] | None = None
+    """Function that connects to an emulated program: an object like `TcpStream`. None: a socket to the address."""
     usb_ids: tuple[int, int] | None = None
     """Vendor and product of an emulated serial port's USB device. None: an emulated port has none, and those of a real
     one are looked up."""

@@ -36,7 +36,7 @@ def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Findi
 
 
 def devices() -> "list[Attached]":
-    """List USB devices that a driver knows, and serial ports, without opening any of them (`rig devices`)."""
+    """List USB devices that a driver knows, Ether Dreams and serial ports, without opening any (`rig devices`)."""
     from rig.devices.doctor import attached
 
     return attached()

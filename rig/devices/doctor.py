@@ -23,6 +23,7 @@ from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, Mark
 from drivers.guard import GuardLimits
 from drivers.interfaces import MARKER_LINE, Pulse, SpadCounters
 from drivers.ring import BlockRing
+from drivers.scanners.etherdream_line import broadcasts
 from drivers.scanners.helios import HELIOS
 from drivers.scanners.lasercube import LASERCUBE
 from drivers.spads.spb_usb_setup import USB_IDS
@@ -157,6 +158,8 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             rig.sync.program(*sync_program(plan, len(plan.legs)))
             findings.append(_plan(plan))
             findings += _frames(look(rig, plan, timing.stride), plan)
+            if (fault := rig.scanner.status.fault) is not None:
+                findings.append(Finding("scanner", False, f"ended on the way: {fault}"))
             if (most := rig.spad.health.memory_high_water_bytes) is not None:
                 findings.append(Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD"))
     except (RigError, DeviceError) as error:
@@ -302,12 +305,14 @@ class Attached:
 
 
 def attached() -> list[Attached]:
-    """List USB devices that a driver knows, then serial ports. Opens nothing."""
+    """List USB devices that a driver knows, Ether Dreams that broadcast, then serial ports. Opens nothing."""
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
         for one in attached_usb(wanted)
     ]
+    for address, heard in dict(broadcasts()).items():
+        found.append(Attached(address, f"etherdream: MAC {heard.mac}, hardware {heard.hardware}", "etherdream"))
     for port in list_ports.comports():
         serial = f", serial={port.serial_number}" if port.serial_number else ""
         found.append(Attached(port.device, f"serial port: {port.description}{serial}", None))

@@ -20,11 +20,13 @@ from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
+from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import DacModel, HeliosModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
+from tests.wire.etherdream import let_pass, open_etherdream, turning, wired
 from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
 from tests.wire.scanners import opened
@@ -92,6 +94,12 @@ def emulated_scanner(folder: Path, kind: str, make: Callable[[], DacModel]) -> I
         yield ScannerCase(device, lambda: model.moving(plugged.now_s()), let_pass)
 
 
+@contextmanager
+def emulated_etherdream(folder: Path, **settings: Any) -> Iterator[ScannerCase]:
+    with wired(EtherDreamModel(**settings)) as wire, open_etherdream(wire) as device:
+        yield ScannerCase(device, partial(turning, wire), partial(let_pass, wire))
+
+
 def _on_board(board: Board, device: SyncSource) -> SyncCase:
     def trigger() -> None:
         board.trigger.pulse(board.now_s + 1e-6, 10e-6)
@@ -144,6 +152,8 @@ SCANNERS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="scanner"),
     "helios, emulated": partial(emulated_scanner, kind="helios", make=HeliosModel),
     "lasercube, emulated": partial(emulated_scanner, kind="lasercube", make=LaserCubeModel),
+    "etherdream, emulated": emulated_etherdream,
+    "etherdream by its page, emulated": partial(emulated_etherdream, by_page=True),
 }
 SYNCS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="sync"),

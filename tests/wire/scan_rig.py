@@ -178,7 +178,9 @@ class ScanBench:
 
 
 @contextmanager
-def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -> Iterator[ScanBench]:
+def scan_bench(
+    applications: Applications, laser: str, silence: str = "1.5 s", scanner: str = "helios"
+) -> Iterator[ScanBench]:
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
         geometry = folder / "calibration.yaml"
@@ -190,6 +192,7 @@ def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -
                 "scene": "street-clear",
                 "laser": laser,
                 "ttl_power": POWER,
+                "scanner": scanner,
                 "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
             }
         )
@@ -199,7 +202,7 @@ def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -
             elif laser == "obis":
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
-            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence)))
+            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence, scanner)))
             bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
             try:
                 yield bench
@@ -221,7 +224,7 @@ def _end(bench: ScanBench) -> None:
     bench.applications.exit_code(bench.number, 5.0)
 
 
-def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
+def _config(laser: str, ports: dict[str, str], silence: str, scanner: str) -> dict[str, Any]:
     """The config of a rig with real ports; its world is outside of it."""
     content = emulated(**ports)
     del content["world"]
@@ -230,6 +233,9 @@ def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
     content["spad"]["silence"] = silence
     # A machine that has much else to do may be late.
     content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}
+    if scanner == "etherdream":
+        del content["scanner"]["frame"]
+        content["scanner"] |= {"kind": scanner, "buffer": "220 ms"}
     content["laser"]["kind"] = laser
     if laser == "ttl":
         content["laser"] = {"kind": laser, "power": POWER, "max_power": "50 mW"}  # a real one has no port

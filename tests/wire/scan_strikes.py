@@ -41,8 +41,8 @@ _END_S = 60.0
 class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
     living, says what happened and ends with code 3. silence: of the SPAD that the guard lets pass; long, since
-    an emulated one may itself be late. labours: threads fight the scan's for the interpreter. light_s, emission_s:
-    until they are gone, at most."""
+    an emulated one may itself be late. scanner: its kind. labours: threads fight the scan's for the interpreter.
+    light_s, emission_s: until they are gone, at most."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
@@ -50,6 +50,7 @@ class ScanStrike:
     own_end: bool = False
     laser_answers: bool = True
     silence: str = "1.5 s"
+    scanner: str = "helios"
     labours: bool = False
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
@@ -88,6 +89,28 @@ def _unplug_gate(bench: ScanBench) -> None:
         bench.world.sync.power_cycle(time.monotonic())
 
 
+def _starve_scanner(bench: ScanBench) -> None:
+    """Nothing reaches it for longer than its buffer lasts."""
+    with bench.world.scanner_plug.lock:
+        time.sleep(0.4)
+
+
+def _stop_scanner(bench: ScanBench) -> None:
+    """Its network's cable comes loose, and is put in again: an emergency stop."""
+    with bench.world.scanner_plug.lock:
+        for up in (False, True):
+            bench.world.scanner.link(up, time.monotonic())
+
+
+def _restart_scanner(bench: ScanBench) -> None:
+    bench.world.scanner_plug.unplug()
+    with bench.world.scanner_plug.lock:
+        bench.world.scanner.power_up(time.monotonic())
+    bench.world.scanner_plug.plug()
+
+
+ETHERDREAM_S = 0.5
+"""It plays what is queued: light is gone after this."""
 SCAN_STRIKES = {
     "application killed": ScanStrike(_signal(signal.SIGKILL), at_once=True),
     "application stopped": ScanStrike(_signal(signal.SIGSTOP)),
@@ -100,6 +123,21 @@ SCAN_STRIKES = {
         _silence_spad, silence="40 ms", labours=True, light_s=FIRST_FRAME_S, emission_s=EMISSION_S + FIRST_FRAME_S
     ),
     "scanner unplugged": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True),
+    "etherdream unplugged": ScanStrike(
+        lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="etherdream"
+    ),
+    "etherdream hangs": ScanStrike(
+        lambda bench: bench.world.scanner_plug.hang(),
+        own_end=True,
+        scanner="etherdream",
+        light_s=ETHERDREAM_S,
+        emission_s=EMISSION_S + 1.5,
+    ),
+    "etherdream starved": ScanStrike(
+        _starve_scanner, own_end=True, scanner="etherdream", light_s=ETHERDREAM_S, emission_s=EMISSION_S + ETHERDREAM_S
+    ),
+    "etherdream stopped": ScanStrike(_stop_scanner, own_end=True, scanner="etherdream"),
+    "etherdream restarted": ScanStrike(_restart_scanner, own_end=True, scanner="etherdream"),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
     "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
     "laser's firmware hangs": ScanStrike(
@@ -140,7 +178,7 @@ def strike_scan(
     waited for.
     """
     made = SCAN_STRIKES[name]
-    with scan_bench(applications, laser, made.silence) as bench:
+    with scan_bench(applications, laser, made.silence, made.scanner) as bench:
         bench.start(maps=MAPS if measured else LONG_MAPS, record=made.record, labours=made.labours)
         opening_s = OPENING_S[laser] if made.at_once else 0.0
         into_s = share * (opening_s + LONG_S)

@@ -81,25 +81,16 @@ def steps(model: EtherDreamModel, *times_s: float) -> list[int]:
     return [round(float((one + 1) / 2 * 4095)) - 0x800 for one in command]
 
 
-# Bytes.
-
-
-def test_it_greets_a_client_as_if_it_had_pinged() -> None:
+def test_replies_broadcast_and_version_are_the_bytes_of_the_page() -> None:
     model = EtherDreamModel()
-    model.connected(0.0)
+    model.connected(0.0)  # as if it had pinged
     assert model.send(1000, 0.0).hex(" ") == "61 3f 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00"
-
-
-def test_the_broadcast_has_36_bytes() -> None:
-    model = EtherDreamModel()
-    Talk(model)(PREPARE + data(point(), point()))
+    talk = Talk(model)
+    assert talk(VERSION) == b"v0.5.5".ljust(32, b"\0")
+    talk(PREPARE + data(point(), point()))
     assert model.broadcast(1.0).hex(" ") == (
         "00 04 a3 87 28 cd 01 00 02 00 07 07 a0 86 01 00 00 00 01 00 00 00 00 00 00 00 02 00 00 00 00 00 00 00 00 00"
     )
-
-
-def test_a_version_has_32_bytes_and_no_status() -> None:
-    assert Talk(EtherDreamModel())(VERSION) == b"v0.5.5".ljust(32, b"\0")
 
 
 def test_a_stream_from_prepare_to_stop() -> None:
@@ -112,77 +103,58 @@ def test_a_stream_from_prepare_to_stop() -> None:
     assert talk(PREPARE) == b"ap" + status(0, 1)
 
 
-def test_bytes_may_come_one_by_one() -> None:
+PLAY = PREPARE + data(*ramp(100)) + begin(25_000)
+TOO_FAST = b"q" + struct.pack("<I", 0x3F00_3F3F)
+
+
+@pytest.mark.parametrize(
+    ("by_page", "dialogue"),
+    [
+        # Out of place: refused, read to the end.
+        (False, [(STOP + PREPARE + PREPARE, b"IsapIp"), (b"\0" + PREPARE, b"a\0Ip")]),
+        (False, [(data(), b"ad"), (data(*ramp(5)) + PING, b"Ida?")]),
+        # Begin is acknowledged though nothing is prepared or there are no points: the first period underflows.
+        (False, [(begin(20_000), b"ab"), (PREPARE + begin(25_000), b"apab")]),
+        # A rate beyond the highest costs one byte, and the rest is read as commands: the zero is an emergency stop.
+        (False, [(begin(100_000), b"ab"), (TOO_FAST, b"Iqa?a?a\0a?"), (CLEAR + begin(100_001), b"acIba\0a\0")]),
+        # Queued rates are acknowledged though they are dropped; c without a stop.
+        (False, [(queue(1000) + CLEAR, b"aqac"), (PREPARE + queue(1000) * 200, b"ap" + b"aq" * 200)]),
+        # Data that does not fit is taken in part and refused as invalid.
+        (False, [(PREPARE + data(*ramp(1790)), b"apad"), (data(*ramp(20)) + data(point()), b"IdId")]),
+        # An emergency stop remains until it is cleared.
+        (False, [(PLAY + b"\xff", b"apadaba\xff"), (data(point()) + begin(1000) + b"\0" + CLEAR, b"Idaba\0ac")]),
+        # By the page what the firmware lets pass is refused.
+        (True, [(begin(25_000) + queue(1000) + CLEAR + data(), b"IbIqIcId")]),
+        (True, [(PREPARE + begin(25_000) + begin(100_001) + update(0), b"apIbIbIu")]),
+        (True, [(PREPARE + queue(1000) * 200, b"ap" + b"aq" * 199 + b"Fq")]),
+        (True, [(PREPARE + data(*ramp(1790)) + data(*ramp(20)), b"apadFd"), (b"x" + data(point()), b"axId")]),
+    ],
+)
+def test_commands_are_answered_as_firmware_and_page_do(by_page: bool, dialogue: list[tuple[bytes, bytes]]) -> None:
+    at_once, one_by_one = Talk(EtherDreamModel(by_page=by_page)), Talk(EtherDreamModel(by_page=by_page))
+    for sent, expected in dialogue:
+        assert at_once.acks(sent) == expected
+        assert b"".join(one_by_one.acks(bytes((one,))) for one in sent) == expected
+        hung_up = at_once.model.hung_up
+        assert one_by_one.model.hung_up == hung_up
+        assert hung_up or at_once.fields() == one_by_one.fields()
+
+
+def test_what_was_dropped_is_counted_and_what_was_taken_kept() -> None:
     talk = Talk(EtherDreamModel())
-    sent = PREPARE + data(*ramp(3)) + queue(30_000) + begin(25_000) + STOP
-    assert b"".join(talk(bytes((one,)))[:2] for one in sent) == b"apadaqabas"
-
-
-def test_data_without_points_is_acknowledged_even_when_idle() -> None:
-    assert Talk(EtherDreamModel()).acks(data()) == b"ad"
-
-
-# Refusals.
-
-
-def test_prepare_and_stop_are_refused_in_the_wrong_state() -> None:
-    talk = Talk(EtherDreamModel())
-    assert talk.acks(STOP + PREPARE + PREPARE) == b"IsapIp"
-    talk(b"\0")
-    assert talk.acks(PREPARE) == b"Ip"
-
-
-def test_data_is_refused_when_idle_and_read_to_its_end() -> None:
-    talk = Talk(EtherDreamModel())
-    assert talk.acks(data(*ramp(5)) + PING) == b"Ida?"
-    assert talk.model.refused == 5
-
-
-def test_data_that_does_not_fit_is_taken_in_part_and_refused_as_invalid() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE)
-    assert talk.acks(data(*ramp(1790))) == b"ad"
-    assert talk(data(*ramp(20))) == b"Id" + status(0, 1, fullness=CLIENTS_BUFFER)
-    assert talk.model.refused == 11
-    assert talk.acks(data(point())) == b"Id"
-
-
-def test_a_packet_that_was_refused_in_part_is_not_taken_up_again() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(CLIENTS_BUFFER)) + begin(25_000))
+    talk(queue(1000) + PREPARE + queue(1000) * 200 + data(*ramp(1790)) + data(*ramp(20)))
+    assert (len(talk.model.queued_rates), talk.model.lost_rates, talk.model.refused) == (199, 2, 11)
+    assert talk.fields()[3] == CLIENTS_BUFFER
+    talk(begin(25_000))
     sent = data(*ramp(20))
     assert talk(sent[:-18]) == b""
-    assert talk.acks(sent[-18:], 10.5 * P_S) == b"Id"
+    assert talk.acks(sent[-18:], 10.5 * P_S) == b"Id", "a packet that was refused in part is not taken up again"
     assert talk.fields()[3] == CLIENTS_BUFFER - 10
-
-
-def test_begin_is_acknowledged_though_nothing_is_prepared_or_there_are_no_points() -> None:
-    talk = Talk(EtherDreamModel())
-    assert talk(begin(20_000)) == b"ab" + status()
-    assert talk.acks(PREPARE + begin(25_000)) == b"apab"
-    assert talk.fields() == (0, 2, 1, 0, 25_000, 0)
-    talk.now_s += 1.01 * P_S
-    assert talk.fields() == (0, 0, 2, 0, 0, 0)
-
-
-def test_a_rate_beyond_the_highest_costs_one_byte_and_the_rest_is_read_as_commands() -> None:
-    talk = Talk(EtherDreamModel())
-    assert talk.acks(begin(100_000)) == b"ab"
-    assert talk.acks(b"q" + struct.pack("<I", 0x3F00_3F3F)) == b"Iqa?a?a\0a?"
-    assert talk.fields()[0] == 3, "the zero was an emergency stop"
-    assert talk.acks(CLEAR + begin(100_001)) == b"acIba\0a\0", "then a1 ends the connection"
-    assert talk.model.hung_up
-
-
-def test_queued_rates_are_acknowledged_though_they_are_dropped() -> None:
-    talk = Talk(EtherDreamModel())
-    assert talk.acks(queue(1000)) == b"aq"
-    assert talk.model.lost_rates == 1
-    talk(PREPARE)
-    assert talk.acks(queue(1000) * 200) == b"aq" * 200
-    assert (len(talk.model.queued_rates), talk.model.lost_rates) == (199, 2)
     talk(STOP + PREPARE)
     assert not talk.model.queued_rates
+    talk.acks(begin(25_000))
+    talk.now_s += 1.01 * P_S
+    assert talk.fields() == (0, 0, 2, 0, 0, 0), "without points it underflows"
 
 
 def test_a_rate_of_zero_stops_the_processor_until_the_power_comes_anew() -> None:
@@ -193,14 +165,6 @@ def test_a_rate_of_zero_stops_the_processor_until_the_power_comes_anew() -> None
         assert talk.model.panicked
         talk.model.power_up(talk.now_s)
         assert talk.acks(PING) == b"a?"
-
-
-def test_an_unknown_command_closes_the_connection_and_stops_nothing() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    assert talk.acks(PING + b"x" + STOP) == b"a?"
-    assert talk.model.hung_up
-    assert talk.model.moving(talk.now_s)
 
 
 def test_a_server_hangs_up_with_its_model() -> None:
@@ -214,60 +178,54 @@ def test_a_server_hangs_up_with_its_model() -> None:
             assert received == b"a?" + status() + b"a?" + status()
 
 
-# Stops.
-
-
-def test_an_emergency_stop_says_its_state_for_its_flags_and_lasts_until_cleared() -> None:
-    for code in (b"\0", b"\xff"):
-        talk = Talk(EtherDreamModel())
-        talk(PREPARE + data(*ramp(100)) + begin(25_000))
-        assert talk(code) == b"a" + code + status(3, 0, flags=4, fullness=100)
-        assert talk.acks(data(point()) + begin(1000) + code) == b"Idaba" + code
-        assert talk(CLEAR) == b"ac" + status(0, 0, flags=4, fullness=100)
-        assert talk(CLEAR)[:2] == b"ac"
-        assert talk(PREPARE) == b"ap" + status(0, 1)
-
-
-def test_an_open_interlock_cannot_be_cleared() -> None:
+@pytest.mark.parametrize("end", ["client", "unknown command", "stop", "emergency", "input", "link", "power"])
+def test_what_ends_playback_and_what_does_not(end: str) -> None:
     talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    talk.model.stop_input(True, talk.now_s)
-    assert talk(CLEAR) == b"!c" + status(3, 0, flags=4, fullness=100)
-    talk.model.stop_input(False, talk.now_s)
-    assert talk.fields()[0] == 3
-    assert talk.acks(CLEAR + PREPARE) == b"acap"
+    model = talk.model
+    talk(PLAY)
+    now_s = talk.now_s = 1.0 + 50 * P_S
+    match end:
+        case "client":
+            model.disconnected(now_s)
+        case "unknown command":
+            assert talk.acks(PING + b"x" + STOP) == b"a?"
+            assert model.hung_up
+        case "stop":
+            assert talk(STOP) == b"as" + status(0, 0, fullness=50)
+        case "emergency":
+            assert talk(b"\0") == b"a\0" + status(3, 0, flags=4, fullness=50), "its state for its flags"
+            assert talk(CLEAR) == b"ac" + status(0, 0, flags=4, fullness=50)
+        case "input":
+            model.stop_input(True, now_s)
+            assert talk(CLEAR) == b"!c" + status(3, 0, flags=4, fullness=50)
+            model.stop_input(False, now_s)
+            assert talk.fields()[0] == 3
+            assert talk.acks(CLEAR + PREPARE) == b"acap"
+        case "link":
+            model.link(False, now_s)
+            assert model.light_engine == 3
+            model.link(True, now_s)
+            assert talk.fields() == (0, 0, 4, 50, 0, 0)
+        case "power":
+            model.power_up(now_s)
+            assert talk.fields() == (0, 0, 0, 0, 0, 0)
+    plays_on = end in ("client", "unknown command")
+    assert model.moving(now_s + 49 * P_S) == plays_on
+    assert not model.moving(now_s + 51.5 * P_S)
+    assert model.history.command(np.array([now_s + 40.5 * P_S]))[0] > CENTRE or not plays_on
+    assert model.history.command(np.array([2.0]))[0] == CENTRE
+    if end == "client":
+        model.connected(2.0)
+        assert model.send(100, 2.0) == b"a?" + status(0, 0, flags=2)
 
 
-def test_a_lost_link_stops_and_is_forgotten_when_it_is_back() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    talk.model.link(False, talk.now_s)
-    assert not talk.model.moving(talk.now_s)
-    assert talk.model.light_engine == 3
-    talk.model.link(True, talk.now_s)
-    assert talk.fields() == (0, 0, 4, 100, 0, 0)
-
-
-def test_a_client_that_goes_away_lets_the_ring_play_on_to_its_end() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    talk.model.disconnected(talk.now_s)
-    assert talk.model.moving(talk.now_s + 99 * P_S)
-    assert not talk.model.moving(talk.now_s + 101.5 * P_S)
-    talk.model.connected(2.0)
-    assert talk.model.send(100, 2.0) == b"a?" + status(0, 0, flags=2)
-
-
-def test_prepared_points_wait_for_the_next_client() -> None:
+def test_prepared_points_wait_for_the_next_client_and_a_half_command_does_not() -> None:
     talk = Talk(EtherDreamModel())
     talk(PREPARE + data(*ramp(3)) + b"d\x05\0" + point())
     talk.model.disconnected(1.0)
     talk.model.connected(2.0)
     assert talk.model.send(100, 2.0) == b"a?" + status(0, 1, fullness=4)
     assert talk.acks(PREPARE) == b"Ip"
-
-
-# Outputs.
 
 
 def test_a_point_is_shown_in_the_second_period_after_it_was_due_and_the_last_one_never() -> None:
@@ -345,53 +303,3 @@ def test_an_update_comes_with_the_next_period() -> None:
         talk.model.advance(2.0)
         ends = np.array([10, 11, 13, 15]) * P_S + 1.0
         assert steps(talk.model, *(ends + 1e-7)) == [8, 9, 10, 11]
-
-
-def test_a_stream_is_the_same_however_often_time_is_asked_for() -> None:
-    histories = []
-    for pieces in (1, 137):
-        talk = Talk(EtherDreamModel())
-        talk(PREPARE + data(*ramp(1000)) + begin(25_000))
-        for now_s in np.linspace(1.0, 1.03, pieces + 1)[1:]:
-            talk.model.advance(float(now_s))
-        talk.now_s = 1.03
-        assert talk.acks(data(*ramp(500))) == b"ad"
-        talk.model.advance(2.0)
-        histories.append(talk.model.history.command(periods(0, 1600)))
-    assert np.array_equal(histories[0], histories[1])
-
-
-def test_a_deaf_firmware_plays_on() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    talk.model.deaf = True
-    assert talk(STOP) == b""
-    assert talk.model.moving(talk.now_s)
-    talk.model.deaf = False
-    assert talk.acks(PING) == b"a?"
-
-
-def test_without_power_the_outputs_are_at_0_v() -> None:
-    talk = Talk(EtherDreamModel())
-    talk(PREPARE + data(*ramp(100)) + begin(25_000))
-    talk.model.power_up(1.0 + 50 * P_S)
-    assert talk.model.history.command(np.array([1.1]))[0] == CENTRE
-    assert talk.fields() == (0, 0, 0, 0, 0, 0)
-
-
-# A device that does as the page says.
-
-
-def test_by_the_page_what_the_firmware_lets_pass_is_refused() -> None:
-    talk = Talk(EtherDreamModel(by_page=True))
-    assert talk.acks(begin(25_000) + queue(1000) + CLEAR + data()) == b"IbIqIcId"
-    assert talk.acks(PREPARE + begin(25_000) + begin(100_001) + update(0)) == b"apIbIbIu"
-    assert talk.acks(queue(1000) * 200) == b"aq" * 199 + b"Fq"
-    assert talk.acks(data(*ramp(1790)) + data(*ramp(20))) == b"adFd"
-    assert talk(PING) == b"a?" + status(0, 1, fullness=1790, rate=30_000)
-    assert talk.acks(begin(25_000)) == b"ab"
-    assert talk.acks(b"x") == b"ax"
-    _, engine, _, _, causes = struct.unpack("<BBBBH", talk(PING)[2:8])
-    assert (engine, causes) == (3, 1)
-    assert not talk.model.moving(talk.now_s)
-    assert talk.acks(data(point())) == b"Id"

@@ -17,6 +17,7 @@ from tests.campaigns.outcomes import campaign
         ("prawndo", 50, 5, "done", 100),
         ("helios", 60, 1, "complete", 1),
         ("lasercube", 50, 1, "complete", 1),
+        ("etherdream", 50, 1, "complete", 1),
         ("spad512s", 20, 20, "complete", 1),
         ("spb-usb", 50, 25, "complete", 1),
     ],

@@ -27,6 +27,7 @@ from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire.etherdream import wired
 from tests.wire.lasers import bring_up, wire
 from tests.wire.spb_device import model
 from tests.wire.syncs import board
@@ -47,6 +48,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
     """A device at each address of the page; the models by slot."""
     with ExitStack() as stack:
         laser, sync = CoboltModel(warm_up_s=0.0), stack.enter_context(board())
+        dream = stack.enter_context(wired())
         _, at_laser = stack.enter_context(wire(laser))
         second = IbeamModel()
         _, at_ibeam = stack.enter_context(wire(second))
@@ -65,6 +67,8 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
             monkeypatch.setattr(module, "alone", lambda surroundings=surroundings: surroundings)
         monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
         monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
+        monkeypatch.setattr("drivers.scanners.etherdream.SystemClock", lambda: dream._clock)
+        monkeypatch.setattr("drivers.scanners.etherdream.Endpoint", lambda port: dream.endpoint)
         monkeypatch.setattr(time, "sleep", clock.sleep)
         yield {"laser": laser, "ibeam": second, "sync": sync.model, "scanner": helios}
 

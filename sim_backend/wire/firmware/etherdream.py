@@ -1,5 +1,5 @@
-"""An Ether Dream laser DAC of the first generation as its firmware behaves, traps included (docs/reference/hardware.md;
-j4cbo/j4cDAC 12ecbe5, the same as release v0.5.5 in all that is modelled).
+"""An Ether Dream laser DAC of the first generation as its firmware behaves, traps included (j4cbo/j4cDAC 12ecbe5, the
+same as release v0.5.5 in all that is modelled; docs/reference/devices/etherdream.md).
 
 Points go over TCP into a ring that is played at a timer's rate. The firmware deviates from the page
 ether-dream.com/protocol.html: data that does not fit is taken in part and then refused with NAK I, never F; b, q and c

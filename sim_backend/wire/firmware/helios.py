@@ -20,6 +20,8 @@ from sim_backend.wire.serve.usb_model import STALL, AlternateSpec, Answer, Devic
 
 Array = NDArray[np.float64]
 
+JOINED_S = 0.1
+"""Duration from which on a piece of the history is not lengthened any more."""
 KEEP_S = 20.0
 """Age at which the output's history is dropped."""
 
@@ -51,6 +53,12 @@ class DacHistory:
     def play(self, played: Played) -> None:
         """Append what is played. It must start at the end of the previous piece or later."""
         with self._lock:
+            if self._played and _joins(self._played[-1], played):
+                last = self._played.pop()
+                self._rests.pop()
+                command = np.concatenate([last.command, played.command])
+                levels = np.concatenate([last.levels, played.levels])
+                played = replace(last, end_s=played.end_s, command=command, levels=levels)
             self._played.append(played)
             self._rests.append((played.end_s, float(played.command[-1])))
             while self._played[0].end_s < played.start_s - KEEP_S:
@@ -113,6 +121,13 @@ class DacHistory:
     def _between(self, from_s: float, until_s: float) -> list[Played]:
         """The pieces that were played in [from_s, until_s], ascending."""
         return [one for one in self._played if one.end_s > from_s and one.start_s <= until_s]
+
+
+def _joins(last: Played, played: Played) -> bool:
+    """Whether two pieces can be kept as one: small ones of a long stream would be thousands to look through."""
+    whole_s = len(last.command) * last.period_s
+    seamless = max(abs(last.start_s + whole_s - at_s) for at_s in (last.end_s, played.start_s)) < 1e-3 * last.period_s
+    return seamless and last.period_s == played.period_s and whole_s < JOINED_S
 
 
 DAC_STEPS = 4095

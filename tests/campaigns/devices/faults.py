@@ -21,6 +21,7 @@ SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "prawndo": prawndo.sequence,
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
+    "etherdream": scanners.etherdream_sequence,
     "spb-usb": spb_usb.sequence,
     "spad512s": spad512s.sequence,
     "blanking": blanking.sequence,

@@ -1,4 +1,4 @@
-"""Random faults on a scanner's USB cable: every sequence ends right, or with one of our errors, in time.
+"""Random faults on a scanner's USB cable or network: every sequence ends right, or with one of our errors, in time.
 
 Runs on a virtual clock, so that seconds of silence cost nothing. 'Right' is judged by what the DAC put out, not by what
 the driver says: where no error and no fault is told, the lit points are the waveform, all of it, without a seam.
@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +18,13 @@ from numpy.typing import NDArray
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from sim_backend.wire.firmware import helios
+from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import DacHistory, DacModel
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire import lasercube
+from tests.wire.etherdream import open_etherdream, wired
 from tests.wire.faults import Fault, FaultSchedule, FaultyUsb
-from tests.wire.scanners import Plugged, finish, open_scanner, plug
+from tests.wire.scanners import finish, open_scanner, plug
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0
@@ -32,14 +36,17 @@ class Subject:
     """A scanner kind under test.
 
     model: a firmware. scan, line, lit: lines of the record: the markers, and one that is high all through the waveform.
+    drive: largest error of the drive.
     """
 
     kind: str
-    model: Callable[[], DacModel]
+    model: Callable[[], DacModel | EtherDreamModel]
     config: dict[str, object]
     scan: int
     line: int
     lit: int
+    drive: float = 1.01 / 4095
+    """A step of the converters."""
 
 
 def wave(device: BeamScanner) -> ScanWaveform:
@@ -50,8 +57,6 @@ def wave(device: BeamScanner) -> ScanWaveform:
     return ScanWaveform(-0.5 * np.cos(2 * np.pi * at / POINTS), markers, device.point_clock(RATE_HZ))
 
 
-DRIVE = 1.01 / 4095
-"""A step of the converters."""
 HELIOS = Subject("helios", helios.HeliosModel, {"frame": "20 ms"}, helios.BLUE, helios.GREEN, helios.RED)
 LASERCUBE = Subject(
     "lasercube",
@@ -61,6 +66,10 @@ LASERCUBE = Subject(
     lasercube.GREEN,
     lasercube.PLAYING,
 )
+ETHERDREAM = Subject("etherdream", EtherDreamModel, {}, helios.BLUE, helios.GREEN, helios.RED, drive=1.14 / 4095)
+
+ETHERDREAM_FAULTS = tuple(kind for kind in Fault if kind is not Fault.CORRUPTED)
+"""TCP has checksums of its own."""
 
 
 def sequence(subject: Subject, seed: int) -> Ending:
@@ -72,24 +81,95 @@ def sequence(subject: Subject, seed: int) -> Ending:
     clock = VirtualClock()
     model = subject.model()
     plugged = plug(FaultyUsb(model, schedule, late_s=rng.choice((0.001, 0.02, 0.2))), clock)
+    opens = partial(open_scanner, subject.kind, plugged.bus, plugged.clock, **subject.config)
+    return _ending(lambda: _judged(subject, rng, opens, plugged.now_s, model.history), schedule, plugged.now_s)
+
+
+def _ending(act: Callable[[], str], schedule: FaultSchedule, now_s: Callable[[], float]) -> Ending:
     foreign: list[str] = []
     before = threading.excepthook
     threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
     try:
-        ended = ending(lambda: _judged(subject, rng, plugged, model.history), plugged.now_s, DEADLINE_S)
+        ended = ending(act, now_s, DEADLINE_S)
     finally:
         threading.excepthook = before
     struck = [fault.value for fault in schedule.struck]
     return ended._replace(wrong=foreign[0] if foreign else ended.wrong, struck=struck)
 
 
-def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> str:
-    with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
+def etherdream_sequence(seed: int) -> Ending:
+    """Besides the faults on the wire the board itself may be stopped, once. At the end it is dark, at the centre."""
+    rng = random.Random(seed)
+    schedule = FaultSchedule(
+        seed,
+        rng.choice((0.001, 0.003, 0.01, 0.05)),
+        ETHERDREAM_FAULTS,
+        skip=rng.randrange(200),
+        most=rng.randrange(1, 5),
+        late_s=rng.choice((0.01, 0.05, 0.3)),
+        stall_s=0.3,
+    )
+    clock_error = rng.uniform(-5e-4, 5e-4)
+    model = StruckEtherDream(
+        rng.choice((None, None, *EVENTS)),
+        rng.randrange(200),
+        by_page=rng.random() < 0.5,
+        clock_error=clock_error,
+        capacity=rng.choice((1799, 3899)),
+    )
+    with wired(model, schedule) as wire:
+        opens = partial(open_etherdream, wire, max_point_rate="25 kHz", buffer=rng.choice(("20 ms", "60 ms")))
+
+        def act() -> str:
+            try:
+                return _judged(ETHERDREAM, rng, opens, lambda: wire.now_s, model.history, clock_error)
+            finally:
+                wire._clock.sleep(0.5)
+                assert not model.moving(wire.now_s), "it plays for ever"
+                at = np.array([wire.now_s])
+                assert model.history.command(at)[0] == helios.CENTRE, "the mirror is not at the centre"
+
+        return _ending(act, schedule, lambda: wire.now_s)
+
+
+EVENTS: dict[str, Callable[[EtherDreamModel, float], None]] = {
+    "stop": lambda model, now_s: model._stop(0, now_s),
+    "emergency stop": lambda model, now_s: model._emergency_stop(1, now_s),
+    "power": EtherDreamModel.power_up,
+    "point twice": lambda model, now_s: setattr(model, "_ring", np.concatenate([model._ring[:1], model._ring])),
+    "point lost": lambda model, now_s: setattr(model, "_ring", model._ring[1:]),
+}
+
+
+class StruckEtherDream(EtherDreamModel):
+    """A board to which something happens before a certain command."""
+
+    def __init__(self, event: str | None, at: int, **options: Any) -> None:
+        super().__init__(**options)
+        self._event, self._left = event, at
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        self._left -= 1
+        if self._left == 0 and self._event is not None:
+            self.advance(now_s)
+            EVENTS[self._event](self, now_s)
+        super().receive(data, now_s)
+
+
+def _judged(
+    subject: Subject,
+    rng: random.Random,
+    opens: Callable[[], BeamScanner],
+    now_s: Callable[[], float],
+    history: DacHistory,
+    clock_error: float = 0.0,
+) -> str:
+    with opens() as device:
         for _ in range(rng.randrange(1, 3)):
             repeats = rng.randrange(3, 8)
             waveform = wave(device)
             clock = device.load(waveform, repeats)
-            began_s = plugged.now_s()
+            began_s = now_s()
             device.start()
             stopped = rng.random() < 0.3
             if stopped:
@@ -101,7 +181,7 @@ def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: Dac
             if fault is not None:
                 assert "\n" not in fault, "a fault of several lines"
                 return "fault"
-            put_out = Played(subject, history, float(clock), began_s, plugged.now_s())
+            put_out = Played(subject, history, float(clock) * (1 + clock_error), began_s, now_s())
             put_out.require(waveform, repeats, stopped=stopped)
             if rng.random() < 0.5:
                 device.park()
@@ -135,7 +215,7 @@ class Played:
         assert not (np.diff(lit.astype(np.int8)) > 0).any(), "the light went out and came again"
         out = self.history.command(times)[lit]
         error = np.abs(out - np.tile(waveform.command, repeats)[at][lit]).max(initial=0)
-        assert error <= DRIVE, f"the mirror was off by {error:g}"
+        assert error <= self.subject.drive, f"the mirror was off by {error:g}"
 
     def _rising(self, line: int) -> NDArray[np.float64]:
         return self.history.rising(line, self.began_s, self.ended_s + 1)
