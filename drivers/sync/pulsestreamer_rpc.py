@@ -22,6 +22,9 @@ CALL_S = 2.0
 """Deadline for a call, from the connection to the end of the answer."""
 RETRY_S = 0.3
 """Time for which a connection that is refused, or closed without a word, is tried again: the box may serve another."""
+_REPEATABLE = ("constant", "get", "has", "is")
+"""Beginnings of methods that may be called again if the box may have heard them already. A second `stream` could stop a
+sequence in its midst, with the gate high."""
 _RETRY_PAUSE_S = 0.005
 _MOST_BYTES = 65_536
 """Longer than any answer."""
@@ -95,8 +98,8 @@ class JsonRpc:
                     f"{self._name}: no connection {where}; check its power, its cable and 'port'"
                 ) from None
             except OSError as error:
-                again = isinstance(error, ConnectionError) and time.monotonic() - begun < RETRY_S
-                if not again:
+                again = isinstance(error, ConnectionError) and (not reached or method.startswith(_REPEATABLE))
+                if not again or time.monotonic() - begun > RETRY_S:
                     raise DeviceDisconnected(
                         f"{self._name} cannot be reached at {self._address} ({one_line(error)}); check its power, its "
                         "cable and 'port'"
