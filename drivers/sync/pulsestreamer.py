@@ -162,7 +162,8 @@ class PulseStreamer(SyncBoard):
 
     @property
     def resolution_s(self) -> float:
-        """1 ns. The trigger is sampled every 8 ns, so a sweep begins 61 to 69 ns after the scan marker."""
+        """1 ns. A sequence as a whole lasts a multiple of 8 ns: its last levels stay so long. The trigger is sampled every
+        8 ns too, so a sweep begins 61 to 69 ns after the scan marker."""
         return RESOLUTION_S
 
     @property

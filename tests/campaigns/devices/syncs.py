@@ -121,6 +121,8 @@ class Sequence:
             assert held == list(words) * asked.repeats, f"the board holds {held[:4]}... ({len(held)})"
 
     def _run(self, device: SyncSource) -> None:
+        if self._asked is None:
+            self._program(device)
         self._begun_s, begun_s = None, self._bench.now_s
         if self._subject.interrupts and self._random.random() < 0.5:
             self._interrupted_run(device)
@@ -134,7 +136,7 @@ class Sequence:
         lowered: list[bool] = []
 
         def lower() -> None:
-            self._bench.pass_time(self._random.uniform(0, 0.005))
+            self._bench.pass_time(self._random.uniform(0, 0.004))
             with suppress(DeviceError):
                 device.abort()
                 lowered.append(True)
