@@ -151,7 +151,7 @@ def test_a_trigger_that_is_not_as_it_was_set_and_a_lost_clock_are_found_before_a
     with pulse_box() as box, box.open() as device:
         device.program(SWEEP, 1)
         box.model._methods["getTriggerStart"] = lambda: 0
-        with pytest.raises(DeviceFault, match="its trigger is 0, not 2"):
+        with pytest.raises(DeviceFault, match="its trigger is 0, not 2: it has restarted"):
             device.run()
         box.model.clock_source = 1
         with pytest.raises(DeviceFault, match="its clock is 1"):
@@ -250,6 +250,16 @@ def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str) -> 
             device.run()
         with pytest.raises(DeviceNotFound, match="Pulse Streamer"):
             box.open(call_s=0.2)
+
+
+def test_a_box_that_restarts_while_it_waits_is_found() -> None:
+    with pulse_box(clock=SystemClock()) as box, box.open() as device:
+        device.program(SWEEP, 3)
+        device.run()
+        with box.server.lock:
+            box.model.power_cycle(box.now_s)
+        eventually(lambda: device.port_lost)
+        device.abort()
 
 
 def test_a_program_whose_answer_is_lost_is_not_sent_again_and_nothing_plays() -> None:
