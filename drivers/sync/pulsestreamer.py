@@ -68,7 +68,7 @@ SOFTWARE, RISING = 1, 2
 AUTO, MANUAL = 0, 1
 """Whether the trigger is armed again after a sequence, or not."""
 CHECK_S = 0.2
-"""Time after which a box that plays nothing is asked whether its trigger is still set: a restart loses the program."""
+"""Time after which a box that waits for the scan marker is asked whether it still does: a restart loses its program."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
 
 _PROBE = Pulse(0, 248e-9)
@@ -78,10 +78,12 @@ _PROBE_S, _PROBE_PAUSE_S = 1.0, 0.01
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A program that was started. count: None if the box itself ends it."""
+    """A program that was started. count: None if the box itself ends it. aborts: how often outputs were taken low
+    before."""
 
     waits: bool
     count: SweepCount | None
+    aborts: int
     over: threading.Event = field(default_factory=threading.Event)
 
 
@@ -164,8 +166,8 @@ class PulseStreamer(SyncBoard):
 
     @property
     def resolution_s(self) -> float:
-        """1 ns. A whole sequence is made a multiple of 8 ns long, with its last levels. The trigger is sampled every 8 ns:
-        a sweep begins 61 to 69 ns after the scan marker."""
+        """1 ns. The box makes a sequence a multiple of 8 ns long, with its last levels, and samples its trigger every 8
+        ns: a sweep begins 61 to 69 ns after the scan marker."""
         return RESOLUTION_S
 
     @property
@@ -201,7 +203,7 @@ class PulseStreamer(SyncBoard):
                 step("stream", sequence.encoded, runs, (0, final, 0, 0))
                 if not sequence.waits:
                     step("startNow")
-                self._run = run = _Run(sequence.waits, count)
+                self._run = run = _Run(sequence.waits, count, aborts)
                 self._require_no_abort(aborts)
         except WrongState:
             self._lower()  # the thread that interrupted may have failed to
@@ -257,6 +259,8 @@ class PulseStreamer(SyncBoard):
             ended = run.count.take(asked_s, now_s(self._clock), plays)
         else:
             ended = not plays and self._flag("hasFinished")
+            if not (plays or ended or run.waits) and self._aborts == run.aborts:
+                raise DeviceFault(f"{self.name}: its program is gone: it has restarted, or another program uses it")
         if ended:
             with self._lock:
                 if self._run is run:
@@ -270,8 +274,9 @@ class PulseStreamer(SyncBoard):
             try:
                 asked_s = now_s(self._clock)
                 plays = self._flag("isStreaming")
-                if not self._has_ended(run, asked_s, plays) and not plays and asked_s > checked_s + CHECK_S:
-                    self._check_trigger(RISING if run.waits else SOFTWARE)
+                ended = self._has_ended(run, asked_s, plays)
+                if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
+                    self._check_trigger(RISING)
                     checked_s = asked_s
             except DeviceError as error:
                 if not run.over.is_set():

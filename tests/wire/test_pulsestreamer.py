@@ -252,9 +252,10 @@ def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str) -> 
             box.open(call_s=0.2)
 
 
-def test_a_box_that_restarts_while_it_waits_is_found() -> None:
+@pytest.mark.parametrize("pulses", [SWEEP, (Pulse(OUT_GATE, 10.0),)])
+def test_a_box_that_restarts_on_the_way_is_found(pulses: tuple[Pulse, ...]) -> None:
     with pulse_box(clock=SystemClock()) as box, box.open() as device:
-        device.program(SWEEP, 3)
+        device.program(pulses, 3)
         device.run()
         with box.server.lock:
             box.model.power_cycle(box.now_s)
