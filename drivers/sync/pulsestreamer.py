@@ -71,8 +71,8 @@ CHECK_S = 0.2
 """Time after which a box that waits for the scan marker is asked whether it still does: a restart loses its program."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
 
-_PROBE = Pulse(0, 248e-9)
-"""The dark test sequence. In the other byte order it lasts 4.2 s."""
+_DARK = compile_sequence("dark", [Pulse(0, 248e-9)], 1, OutputPins(), external_hold=False).encoded
+"""A dark sequence of 248 ns. Read in the other byte order it lasts 4.2 s."""
 _PROBE_S, _PROBE_PAUSE_S = 1.0, 0.01
 
 
@@ -248,9 +248,10 @@ class PulseStreamer(SyncBoard):
                 self._run, self._ended = None, ended
             self._safe = False
             self._rpc.call("setTrigger", SOFTWARE, MANUAL)
-            # Again: until now a trigger may have started what was armed. A question of an interrupted `run` that the
-            # box takes up only after this cannot raise the gate: a sequence needs `startNow`, `startNow` a sequence.
-            self._rpc.call("constant", LOW)
+            # In place of the program, which some firmware may keep: whatever call of an interrupted or failed `run` the
+            # box takes up only after this, it has nothing else to play.
+            self._rpc.call("stream", _DARK, 1, LOW)
+            self._rpc.call("constant", LOW)  # again: until now a trigger may have started what was armed
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
@@ -323,8 +324,7 @@ class PulseStreamer(SyncBoard):
     def _check_timing(self) -> None:
         """Play a dark sequence: it shows whether the box reads durations as they are meant (clients have sent them in
         both byte orders), waits for its start, and reports its end."""
-        probe = compile_sequence(self.name, [_PROBE], 1, OutputPins(), external_hold=False)
-        self._rpc.call("stream", probe.encoded, 1, LOW)
+        self._rpc.call("stream", _DARK, 1, LOW)
         waits = not self._flag("isStreaming") and not self._flag("hasFinished")
         self._rpc.call("startNow")
         ends_s = now_s(self._clock) + _PROBE_S

@@ -100,7 +100,7 @@ def test_opening_first_takes_all_low_whatever_the_box_was_doing(keeps_sequence: 
 
 
 def test_each_verb_says_what_it_has_to_and_no_more() -> None:
-    lowering = [("constant", LOW), ("setTrigger", 1, 1), ("constant", LOW)]
+    lowering = [("constant", LOW), ("setTrigger", 1, 1), "stream 1 times", ("constant", LOW)]
     with pulse_box() as box, box.open() as device:
         calls = heard(box)
         for pulses, repeats, expected in (
@@ -115,14 +115,11 @@ def test_each_verb_says_what_it_has_to_and_no_more() -> None:
             calls.clear()
             device.program(pulses, repeats)
             assert calls == ["getClock"]
-            calls.clear()
-            device.run()
-            told = [f"stream {call[2]} times" if call[0] == "stream" else call for call in calls]
-            assert [call for call in told if call not in ("isStreaming", "hasFinished")] == expected
-            for lower in (device.gate_low, device.abort):
+            for verb, told in ((device.run, expected), (device.gate_low, lowering), (device.abort, lowering)):
                 calls.clear()
-                lower()
-                assert [call for call in calls if call != "isStreaming"] == lowering
+                verb()
+                said = [f"stream {call[2]} times" if call[0] == "stream" else call for call in calls]
+                assert [call for call in said if call not in ("isStreaming", "hasFinished")] == told
 
 
 @pytest.mark.parametrize(
@@ -159,31 +156,37 @@ def test_a_trigger_that_is_not_as_it_was_set_and_a_lost_clock_are_found_before_a
         assert box.model.program is None
 
 
-@pytest.mark.parametrize("heard_already", [False, True])
-@pytest.mark.parametrize("index", range(5))
+@pytest.mark.parametrize("heard", ["never", "late", "at once"])
+@pytest.mark.parametrize("pulses", [(GATE,), SWEEP])
 @pytest.mark.parametrize("keeps_sequence", [False, True])
-def test_ctrl_c_anywhere_on_the_way_to_light_leaves_it_dark(
-    index: int, heard_already: bool, keeps_sequence: bool, monkeypatch: pytest.MonkeyPatch
+def test_ctrl_c_anywhere_on_the_way_to_light_leaves_it_dark_whatever_the_box_hears_late(
+    heard: str, pulses: tuple[Pulse, ...], keeps_sequence: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pulse_box(keeps_sequence=keeps_sequence) as box, box.open() as device:
-        device.program((GATE,), 1000)
-        exchange, left = device._rpc.call, [index]
+        device.program(pulses, 1000)
+        exchange = device._rpc.call
+        for index in range(5 - (pulses == SWEEP)):
+            left, late = [index], []
 
-        def interrupted(method: str, *params: Any) -> Any:
-            left[0] -= 1
-            if left[0] == -1 and not heard_already:
-                raise KeyboardInterrupt
-            result = exchange(method, *params)
-            if left[0] == -1:
-                raise KeyboardInterrupt
-            return result
+            def interrupted(method: str, *params: Any, left: Any = left, late: Any = late) -> Any:
+                left[0] -= 1
+                if left[0] == -1 and heard != "at once":
+                    late.append((method, *params))
+                    raise KeyboardInterrupt
+                result = exchange(method, *params)
+                if left[0] == -1:
+                    raise KeyboardInterrupt
+                return result
 
-        monkeypatch.setattr(device._rpc, "call", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            device.run()
-        since_s = box.now_s
-        box.clock.sleep(1.0)
-        assert not any(level for _, level in box.changes(since_s))
+            monkeypatch.setattr(device._rpc, "call", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                device.run()
+            for call in late if heard == "late" else []:
+                exchange(*call)
+            since_s = box.now_s
+            box.trigger.pulse(since_s + 0.1, 0.1)
+            box.clock.sleep(1.0)
+            assert not any(level for _, level in box.changes(since_s)), index
 
 
 @pytest.mark.parametrize("step", ["constant", "setTrigger", "getTriggerStart", "stream", "startNow"])
@@ -272,7 +275,7 @@ def test_a_program_whose_answer_is_lost_is_not_sent_again_and_nothing_plays() ->
         faults._script = [None, None, None, Fault.LOST]
         with pytest.raises(DeviceDisconnected):
             device.run()
-        assert [call[0] for call in calls].count("stream") == 1
+        assert (calls[3][0], calls[4]) == ("stream", ("constant", LOW))
         faults._script = [Fault.LOST]
         assert device.status.outputs == 0, "a question is asked again"
         box.trigger.pulse(box.now_s + 0.1, 0.1)

@@ -1,6 +1,6 @@
 """A Swabian Instruments Pulse Streamer 8/2 as a model: its RPC calls, its binary uploads and its digital outputs.
 
-Facts: docs/reference/hardware-pulsestreamer-model.md. Its traps are modelled too. The trigger is an edge: a line that
+Facts: docs/reference/devices/pulsestreamer.md. Its traps are modelled too. The trigger is an edge: a line that
 is high when the device is armed starts nothing until it has been low. A trigger while a sequence plays is lost. A run
 is padded to a multiple of 8 ns. Outputs lag an edge by 61 to 69 ns. With manual rearm there is one sequence per
 `rearm`. Since firmware 1.1, the `pulsestreamer` package uploads sequences over a TCP port of their own. Before, they
