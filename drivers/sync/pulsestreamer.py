@@ -227,8 +227,10 @@ class PulseStreamer(SyncBoard):
             if not self._has_ended(run, asked_s, plays):
                 return SyncStatus("running" if plays or not run.waits else "waiting", None)
         with self._lock:  # another thread may just be taking the outputs low
-            low = not self._flag("isStreaming") and self._safe and self._run is None
-            return SyncStatus(self._ended if self._run is None else "running", 0 if low else None)
+            plays = self._flag("isStreaming")
+            if plays or self._run is not None:
+                return SyncStatus("running", None)
+            return SyncStatus(self._ended, 0 if self._safe else None)
 
     def _do_close(self) -> None:
         if self._run is not None:

@@ -176,8 +176,10 @@ class Sequence:
         """AssertionError where something else has come out since `run` than the program, or more of it."""
         if self._begun_s is None or self._asked is None:
             return
-        (_, first), *changes = self._bench.changes(self._begun_s)
-        assert first == 0, f"outputs were {first} before `run`"
+        changes = self._bench.changes(self._begun_s)
+        while changes and changes[0][1]:  # the end of the program before, which `run` has waited for
+            changes.pop(0)
+        changes = changes[1:]
         words = self._asked.words
         wrong = None
         for index, (at_s, outputs) in enumerate(changes):
@@ -191,7 +193,9 @@ class Sequence:
         if wrong is not None and index == len(changes) - 1 and outputs == 0:
             # Taken low by the driver itself: the device was lost, or sweeps were counted late. Or by an earlier verb
             # that was told to have failed: its question is heard late.
-            lost = getattr(device, "port_lost", False) or "DeviceTimeout" in self._verb.ends
+            lost = getattr(device, "port_lost", False) or not {"DeviceTimeout", "ProtocolError"}.isdisjoint(
+                self._verb.ends
+            )
             wrong = None if self._asked.waits or lost else wrong
         assert wrong is None, wrong
 
