@@ -192,11 +192,9 @@ class Sequence:
             wrong = f"{len(changes)} words for {self._asked.repeats} repeats"
         if wrong is not None and index == len(changes) - 1 and outputs == 0:
             # Taken low by the driver itself: the device was lost, or sweeps were counted late. Or by an earlier verb
-            # that was told to have failed: its question is heard late.
-            lost = getattr(device, "port_lost", False) or not {"DeviceTimeout", "ProtocolError"}.isdisjoint(
-                self._verb.ends
-            )
-            wrong = None if self._asked.waits or lost else wrong
+            # whose question, or a repeated one, is heard late.
+            late = {Fault.LATE, Fault.STALL} & {*self._faults.struck}
+            wrong = None if self._asked.waits or late or getattr(device, "port_lost", False) else wrong
         assert wrong is None, wrong
 
     def _require_low(self) -> None:
