@@ -1,4 +1,4 @@
-"""What boards that play patterns have in common: outputs on pins of the user's choice, and a start that fails dark."""
+"""The base of boards that play patterns: outputs on pins of the user's choice, and a start that fails dark."""
 
 import logging
 from dataclasses import dataclass

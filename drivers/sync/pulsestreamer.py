@@ -184,6 +184,10 @@ class PulseStreamer(SyncBoard):
     def _do_run(self) -> None:
         sequence, aborts = self._sequence, self._aborts
         assert sequence is not None
+        if (settles_in_s := self._rpc.settles_in_s) > 0:
+            raise DeviceTimeout(
+                f"{self.name} has not answered a call that it may still hear; run again in {settles_in_s:.1f} s"
+            )
         once = sequence.sweeps == 1 or not sequence.waits
         start = RISING if sequence.waits else SOFTWARE
 

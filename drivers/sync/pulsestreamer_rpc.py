@@ -8,6 +8,7 @@ The number in an answer is not compared with that of the question: newer clients
 import http.client
 import itertools
 import json
+import math
 import socket
 import time
 from typing import Any
@@ -20,6 +21,9 @@ from drivers.transports.tap import IN, OUT, Tap
 PORT = 8050
 CALL_S = 2.0
 """Deadline for a call, from the connection to the end of the answer."""
+LATE_CALLS = 5
+"""So many times the deadline after a call that was not answered no program is started: heard late, the call could stop
+the program in its midst, with the gate high."""
 RETRY_S = 0.3
 """Time for which a connection that is refused, or closed without a word, is tried again: the box may serve another."""
 _REPEATABLE = ("constant", "get", "has", "is")
@@ -39,7 +43,7 @@ class JsonRpc:
         Raises `DeviceNotFound` for an address that is none or a host that is not known.
         """
         self._name, self._address, self._tap, self._call_s = name, address, tap, call_s
-        self._numbers = itertools.count(1)
+        self._numbers, self._unanswered_s = itertools.count(1), -math.inf
         host, colon, port = address.partition(":")
         if not host or (colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65_536)):
             raise DeviceNotFound(f"{name}: {address!r} is no address; write 'port' as host or host:port")
@@ -48,6 +52,11 @@ class JsonRpc:
         except (OSError, UnicodeError) as error:
             raise DeviceNotFound(f"{name}: {host!r} is not known ({one_line(error)}); correct 'port'") from None
         self._peer: tuple[Any, ...] = found[0][4]
+
+    @property
+    def settles_in_s(self) -> float:
+        """Time in which the box may still hear a call that it has not answered; 0 or less if there is none."""
+        return self._unanswered_s + LATE_CALLS * self._call_s - time.monotonic()
 
     def call(self, method: str, *params: Any) -> Any:
         """Call a method of the box and return its result.
@@ -93,6 +102,7 @@ class JsonRpc:
             except TimeoutError:
                 where = f"within {self._call_s:g} s at {self._address}"
                 if reached:
+                    self._unanswered_s = time.monotonic()
                     raise DeviceTimeout(f"{self._name} did not answer {method} {where}; power-cycle it") from None
                 raise DeviceDisconnected(
                     f"{self._name}: no connection {where}; check its power, its cable and 'port'"

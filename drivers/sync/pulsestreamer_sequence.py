@@ -1,4 +1,4 @@
-"""What a Pulse Streamer plays: the sequence for a program of the sync source, and the number of its sweeps so far.
+"""Sequences of a Pulse Streamer: the one for a program of the sync source, and the number of its sweeps so far.
 
 The box cannot wait within a sequence, nor look at the scan marker while it plays: see `pulsestreamer`.
 """
@@ -36,7 +36,7 @@ _CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class GateSequence:
-    """What the box plays after each wait. steps: `STEP` (n,). sweeps: number of times. waits: whether it waits for the
+    """Steps that the box plays after each wait. steps: `STEP` (n,). sweeps: number of times. waits: whether it waits for the
     scan marker before each; rest: levels of the channels meanwhile.
     """
 

@@ -266,6 +266,20 @@ def test_a_box_that_restarts_on_the_way_is_found(pulses: tuple[Pulse, ...]) -> N
         device.abort()
 
 
+def test_no_program_starts_while_the_box_may_still_hear_a_call_that_it_has_not_answered() -> None:
+    """A `stream` of an earlier abort, heard late, would stop the program in its midst, with the gate high."""
+    with pulse_box() as box, box.open(call_s=0.1) as device:
+        device.program((GATE,), 1000)
+        box.server.hang()
+        with pytest.raises(DeviceTimeout):
+            device.abort()
+        box.server.resume()
+        with pytest.raises(DeviceTimeout, match="may still hear; run again in 0"):
+            device.run()
+        eventually(lambda: device._rpc.settles_in_s <= 0)
+        device.run()
+
+
 def test_a_program_whose_answer_is_lost_is_not_sent_again_and_nothing_plays() -> None:
     """A second `stream` could stop the first one in its midst, with the gate high."""
     faults = FaultScript()
