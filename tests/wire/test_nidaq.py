@@ -88,11 +88,11 @@ def test_a_config_that_cannot_be_is_refused(given: dict[str, Any], reason: str) 
 
 def test_a_notebook_gives_si_values_and_gets_one_line() -> None:
     limits: dict[str, Any] = {"max_velocity_per_s": 400.0, "max_acceleration_per_s2": 1e6}
-    with pytest.raises(LimitExceeded, match="full_scale: .*less than or equal to 10"):
+    with pytest.raises(LimitExceeded, match=r"full_scale: .*less than or equal to 10"):
         Nidaq.open("Dev1", full_scale_v=12.0, **limits)
     with pytest.raises(LimitExceeded, match="give a terminal and its rate"):
         Nidaq.open("Dev1", clock="PFI0", **limits)
-    with pytest.raises(DeviceNotFound, match="NoSuchCard.*; "):
+    with pytest.raises(DeviceNotFound, match=r"NoSuchCard.*; "):
         Nidaq.open("NoSuchCard", **limits)
 
 

@@ -19,7 +19,7 @@ from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.spads import spad512s, spb_usb
-from drivers.sync import prawndo
+from drivers.sync import prawndo, pulsestreamer
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
@@ -30,7 +30,7 @@ from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.etherdream import wired
 from tests.wire.lasers import bring_up, wire
 from tests.wire.spb_device import model
-from tests.wire.syncs import board
+from tests.wire.syncs import board, pulse_box
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "devices.md"
 CELLS = [
@@ -55,12 +55,14 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         ids = replace(sync.server.endpoint, usb_ids=(0x2E8A, 0x000A))
         spad = stack.enter_context(TcpServer(Spad512sModel(frames)))
         clock = VirtualClock()
+        box = stack.enter_context(pulse_box(clock=clock))
         bus, helios = EmulatedUsb(clock), HeliosModel()
         bus.plug(helios)
         places = {
             cobolt: replace(at_laser, ports={"laser": at_laser.ports["laser"]}),
             ibeam: at_ibeam,
             prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
+            pulsestreamer: Surroundings(clock, None, 0, {"sync": box.server.endpoint}),
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
         }
         for module, surroundings in places.items():
@@ -71,13 +73,19 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         monkeypatch.setattr("drivers.scanners.etherdream.Endpoint", lambda port: dream.endpoint)
         monkeypatch.setattr(time, "sleep", clock.sleep)
         yield {"laser": laser, "ibeam": second, "sync": sync.model, "scanner": helios}
+        assert not box.pins
 
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.split("import ")[1].split()[0])
 def test_the_cells_of_the_page_run_as_they_are_written(
     cell: str, lab: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    addresses = {"/dev/ttyUSB0": "emulated:laser", "/dev/ttyACM0": "emulated:sync", "127.0.0.1:9999": "emulated:spad"}
+    addresses = {
+        "/dev/ttyUSB0": "emulated:laser",
+        "/dev/ttyACM0": "emulated:sync",
+        "192.168.1.10": "emulated:sync",
+        "127.0.0.1:9999": "emulated:spad",
+    }
     for real, emulated in addresses.items():
         cell = cell.replace(real, emulated)
     exec(compile(cell, str(PAGE), "exec"), {})

@@ -1,6 +1,6 @@
 """A Swabian Instruments Pulse Streamer 8/2 as a model: its RPC calls, its binary uploads and its digital outputs.
 
-Facts: docs/reference/hardware-pulsestreamer-model.md. Its traps are modelled too. The trigger is an edge: a line that
+Facts: docs/reference/devices/pulsestreamer.md. Its traps are modelled too. The trigger is an edge: a line that
 is high when the device is armed starts nothing until it has been low. A trigger while a sequence plays is lost. A run
 is padded to a multiple of 8 ns. Outputs lag an edge by 61 to 69 ns. With manual rearm there is one sequence per
 `rearm`. Since firmware 1.1, the `pulsestreamer` package uploads sequences over a TCP port of their own. Before, they
@@ -47,8 +47,6 @@ STEP_BYTES = 9
 MAX_STEPS = 2_000_000
 MAX_TICKS = 0xFFFF_FFFF
 ANALOG_MAX = 0x7FFF
-SAMPLE_S = 10e-6
-"""Distance of the times at which a model without `low` looks whether the trigger line is low."""
 METHOD_NOT_FOUND, INVALID_PARAMS = -32601, -32602
 """Codes of JSON-RPC 2.0."""
 
@@ -122,24 +120,22 @@ class _Span:
 class PulseStreamerModel:
     """The device and its outputs. Times are seconds of whatever clock the wire runs on; they never decrease.
 
-    trigger: the first time in [from, until) at which the trigger line is high, or None; if it is None: always low.
-    low: the same for low. Without it the line is looked at every `SAMPLE_S`, so that gaps shorter than that can be
-    missed. version: that of the firmware. rearm_s: time from the end of a sequence until a trigger counts again.
+    trigger, low: the first time in [from, until) at which the trigger line is high, or low, or None; without either it
+    is always low. version: that of the firmware. rearm_s: time from the end of a sequence until a trigger counts again.
     keeps_sequence: whether a trigger starts the sequence again even after `constant` or `forceFinal`.
     """
 
     def __init__(
         self,
-        trigger: Line | None = None,
+        trigger: Line = lambda from_s, until_s: None,
         *,
-        low: Line | None = None,
+        low: Line = lambda from_s, until_s: from_s,
         version: str = "1.7.0",
         serial: str = "00:26:32:F0:3B:1B",
         rearm_s: float = 10e-6,
         keeps_sequence: bool = False,
     ) -> None:
-        self._high: Line = trigger or (lambda from_s, until_s: None)
-        self._low: Line = low or self._sampled_low
+        self._high, self._low = trigger, low
         self.version, self.serial = version, serial
         self._rearm_s, self._keeps_sequence = rearm_s, keeps_sequence
         self.http_port, self.http_path = RPC_PORT, RPC_PATH
@@ -317,12 +313,6 @@ class PulseStreamerModel:
 
     def _is_high(self, at_s: float) -> bool:
         return self._high(at_s, math.nextafter(at_s, math.inf)) is not None
-
-    def _sampled_low(self, from_s: float, until_s: float) -> float | None:
-        for index in range(math.ceil(from_s / SAMPLE_S), math.ceil(until_s / SAMPLE_S)):
-            if not self._is_high(index * SAMPLE_S):
-                return index * SAMPLE_S
-        return None
 
     # Calls
 

@@ -11,14 +11,17 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
-from tests.campaigns.devices import blanking, lasers, prawndo, scanners, spad512s, spb_usb
+from tests.campaigns.devices import blanking, lasers, scanners, spad512s, spb_usb, syncs
+from tests.campaigns.devices.prawndo import PRAWNDO
+from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "obis": partial(lasers.sequence, lasers.OBIS),
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
     "ibeam": partial(lasers.sequence, lasers.IBEAM),
-    "prawndo": prawndo.sequence,
+    "prawndo": partial(syncs.sequence, PRAWNDO),
+    "pulsestreamer": partial(syncs.sequence, PULSESTREAMER),
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
     "etherdream": scanners.etherdream_sequence,
@@ -31,6 +34,7 @@ WATCHED = {
     "cobolt": "longest verb, s",
     "ibeam": "longest verb, s",
     "prawndo": "longest verb, s",
+    "pulsestreamer": "longest verb, s",
     "blanking": "largest error of a synchronised map, columns",
 }
 """Their worst figure; of the others it is the time of the longest sequence."""
