@@ -12,17 +12,18 @@ marker in this way. Pulses that the board would play differently from what was w
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
-from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse, SyncSource, SyncStatus, sliced
+from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
+from drivers.interfaces import Pulse, SyncStatus, sliced
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
@@ -38,27 +39,6 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 
 @dataclass(frozen=True, slots=True)
-class OutputPins:
-    """The pins, 0 to 15, that carry the outputs `OUT_*`."""
-
-    frame: int = 0
-    gate: int = 1
-    marker: int = 2
-
-    def levels(self, outputs: int) -> int:
-        """Levels of the pins for an OR of `OUT_*`."""
-        return sum(1 << pin for output, pin in self._pairs if outputs & output)
-
-    def outputs(self, levels: int) -> int:
-        """The OR of those `OUT_*` whose pins are high."""
-        return sum(output for output, pin in self._pairs if levels >> pin & 1)
-
-    @property
-    def _pairs(self) -> tuple[tuple[int, int], ...]:
-        return (OUT_FRAME, self.frame), (OUT_GATE, self.gate), (OUT_MARKER, self.marker)
-
-
-@dataclass(frozen=True, slots=True)
 class ProgramLimits:
     """Limits of a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
 
@@ -66,7 +46,7 @@ class ProgramLimits:
     clock_hz: float
     max_words: int
     trigger_pulse_s: float
-    pins: OutputPins = OutputPins()
+    pins: OutputPins = field(default_factory=OutputPins)
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
@@ -138,7 +118,7 @@ _STATES: Sequence[Literal["stopped", "running", "aborted"]] = (
 """Meaning of each `run-status`."""
 
 
-class PrawnDoConfig(KindConfig):
+class PrawnDoConfig(BoardConfig):
     """Config of a PrawnDO board."""
 
     kind: Literal["prawndo"] = "prawndo"
@@ -166,23 +146,8 @@ class PrawnDoConfig(KindConfig):
     gate_output: Annotated[int, Field(ge=0, le=15, description="output that is the laser's gate")] = 1
     marker_output: Annotated[int, Field(ge=0, le=15, description="output that marks the SPAD's records")] = 2
 
-    @model_validator(mode="after")
-    def _check_outputs(self) -> Self:
-        used = (self.frame_output, self.gate_output, self.marker_output)
-        for output in used:
-            if used.count(output) > 1:
-                raise ValueError(
-                    f"output {output} has two uses; give frame_output, gate_output and marker_output one each"
-                )
-        return self
 
-    @property
-    def pins(self) -> OutputPins:
-        """The pins that carry the outputs."""
-        return OutputPins(self.frame_output, self.gate_output, self.marker_output)
-
-
-class PrawnDo(SyncSource):
+class PrawnDo(SyncBoard):
     """A PrawnDO board. Opening it first takes all outputs low, whatever the board was doing."""
 
     def __init__(self, config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> None:
@@ -240,20 +205,6 @@ class PrawnDo(SyncSource):
     def port_lost(self) -> bool:
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
-
-    def run(self) -> None:
-        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
-        the board may have started although its answer did not arrive."""
-        try:
-            super().run()
-        except WrongState:
-            raise  # nothing was sent
-        except BaseException:
-            try:
-                self._line.lower()
-            except DeviceError as error:
-                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
-            raise
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""

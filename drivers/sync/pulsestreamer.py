@@ -1,9 +1,8 @@
 """Pulse Streamer 8/2 of Swabian Instruments: eight outputs, 1 ns steps, a trigger input, JSON-RPC over the network.
 
-Facts: docs/reference/hardware.md. Outputs: unless the config says otherwise, channel 0 triggers the SPAD, channel 1 is
-the laser's gate, channel 2 marks records. The vendor's package `pulsestreamer` is not used: it takes no port, waits
-10 s for an answer, prints, and obeys the environment's web proxies; and its versions 1 and 2.1 send steps in different
-byte orders by JSON-RPC. `pulsestreamer_rpc` speaks the documented interface with the standard library.
+Facts: docs/reference/devices/pulsestreamer.md. Outputs: unless the config says otherwise, channel 0 triggers the SPAD,
+channel 1 is the laser's gate, channel 2 marks records. The vendor's package `pulsestreamer` is not used: it takes no
+port, waits 10 s for an answer, prints, and obeys the environment's web proxies.
 
 **Waits.** The box cannot wait within a sequence. It waits for a rising edge of its trigger input before one, plays it,
 and ignores edges meanwhile. So a program may wait for the scan marker where it begins, and again only where it repeats:
@@ -25,16 +24,16 @@ hardware trigger armed, and says that it plays nothing; and as None otherwise.
 """
 
 import logging
+import re
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal
 
-import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
+from drivers.clock import now_s
 from drivers.errors import (
     DeviceDisconnected,
     DeviceError,
@@ -44,15 +43,14 @@ from drivers.errors import (
     ProtocolError,
     WrongState,
 )
-from drivers.interfaces import Pulse, SyncSource, SyncStatus
+from drivers.interfaces import Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
-from drivers.sync.prawndo import OutputPins
-from drivers.sync.pulsestreamer_rpc import JsonRpc
+from drivers.registry import Kind, Surroundings, alone, config_of
+from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
+from drivers.sync.pulsestreamer_rpc import CALL_S, JsonRpc
 from drivers.sync.pulsestreamer_sequence import (
     IDLE_POLL_S,
     RESOLUTION_S,
-    STEP,
     GateSequence,
     SweepCount,
     compile_sequence,
@@ -71,10 +69,9 @@ AUTO, MANUAL = 0, 1
 """Whether the trigger is armed again after a sequence, or not."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
 
-_PROBE_TICKS = 0xF8
-"""Duration of the dark test sequence: 248 ns, or 4.2 s if read in the other byte order."""
-_PROBE_S = 1.0
-_PROBE_PAUSE_S = 0.01
+_PROBE = Pulse(0, 248e-9)
+"""The dark test sequence. In the other byte order it lasts 4.2 s."""
+_PROBE_S, _PROBE_PAUSE_S = 1.0, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +83,7 @@ class _Run:
     over: threading.Event = field(default_factory=threading.Event)
 
 
-class PulseStreamerConfig(KindConfig):
+class PulseStreamerConfig(BoardConfig):
     """Config of a Pulse Streamer 8/2."""
 
     kind: Literal["pulsestreamer"] = "pulsestreamer"
@@ -105,32 +102,18 @@ class PulseStreamerConfig(KindConfig):
     gate_output: Annotated[int, Field(ge=0, le=7, description="output that is the laser's gate")] = 1
     marker_output: Annotated[int, Field(ge=0, le=7, description="output that marks the SPAD's records")] = 2
 
-    @model_validator(mode="after")
-    def _check_outputs(self) -> Self:
-        used = (self.frame_output, self.gate_output, self.marker_output)
-        for output in used:
-            if used.count(output) > 1:
-                raise ValueError(
-                    f"output {output} has two uses; give frame_output, gate_output and marker_output one each"
-                )
-        return self
 
-    @property
-    def pins(self) -> OutputPins:
-        """The channels that carry the outputs."""
-        return OutputPins(self.frame_output, self.gate_output, self.marker_output)
-
-
-class PulseStreamer(SyncSource):
+class PulseStreamer(SyncBoard):
     """A Pulse Streamer 8/2. Opening it first takes all outputs low, whatever the box was doing, and resets it.
 
     The box obeys everybody on its network: keep other programs away from it.
     """
 
-    def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings) -> None:
+    def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings, call_s: float = CALL_S) -> None:
+        """call_s: longest wait for an answer."""
         super().__init__("Pulse Streamer")
-        self._config = config
-        self._rpc = JsonRpc(self.name, resolve(config.port, surroundings.ports).address, surroundings.tap)
+        self._config, self._clock = config, surroundings.clock
+        self._rpc = JsonRpc(self.name, resolve(config.port, surroundings.ports).address, surroundings.tap, call_s)
         self._lock = threading.RLock()
         self._sequence: GateSequence | None = None
         self._run: _Run | None = None
@@ -149,7 +132,7 @@ class PulseStreamer(SyncSource):
         self._serial = str(self._rpc.call("getSerial"))
         self._rpc.call("selectClock", CLOCKS[config.clock])
         self._check_clock()
-        self._order = self._byte_order()
+        self._check_timing()
 
     @classmethod
     def open(cls, port: str, *, surroundings: Surroundings | None = None, **settings: Any) -> "PulseStreamer":
@@ -187,20 +170,6 @@ class PulseStreamer(SyncSource):
         """Whether the box has not answered while a program ran. May be called from any thread."""
         return self._lost
 
-    def run(self) -> None:
-        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
-        the box may have started although its answer did not arrive."""
-        try:
-            super().run()
-        except WrongState:
-            raise  # nothing was sent, or all is low again
-        except BaseException:
-            try:
-                self._lower()
-            except DeviceError as error:
-                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
-            raise
-
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
         external = self._config.hold == "external"
         sequence = compile_sequence(self.name, pulses, repeats, self._config.pins, external_hold=external)
@@ -222,13 +191,12 @@ class PulseStreamer(SyncSource):
                 self._safe = False
                 step("constant", (0, sequence.rest, 0, 0))
                 step("setTrigger", start, MANUAL if once else AUTO)
-                if (
-                    found := step("getTriggerStart")
-                ) != start:  # a sequence for the trigger IMMEDIATE would start at once
+                found = step("getTriggerStart")
+                if found != start:  # a sequence for the trigger IMMEDIATE would start at once
                     raise DeviceFault(f"{self.name}: its trigger is {found!r}, not {start}; power-cycle it")
-                count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, time.monotonic())
+                count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, now_s(self._clock))
                 runs, final = 1 if sequence.waits else sequence.sweeps, 0 if once else sequence.rest
-                step("stream", sequence.encoded(self._order), runs, (0, final, 0, 0))
+                step("stream", sequence.encoded, runs, (0, final, 0, 0))
                 if not sequence.waits:
                     step("startNow")
                 self._run = run = _Run(sequence.waits, count)
@@ -250,7 +218,7 @@ class PulseStreamer(SyncSource):
     def _do_status(self) -> SyncStatus:
         run = self._run
         if run is not None:
-            asked_s = time.monotonic()
+            asked_s = now_s(self._clock)
             plays = self._flag("isStreaming")
             if not self._has_ended(run, asked_s, plays):
                 return SyncStatus("running" if plays or not run.waits else "waiting", None)
@@ -284,7 +252,7 @@ class PulseStreamer(SyncSource):
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
         """Whether a program has ended, judged by an answer of the box; if so, take the outputs low."""
         if run.count is not None:
-            ended = run.count.take(asked_s, time.monotonic(), plays)
+            ended = run.count.take(asked_s, now_s(self._clock), plays)
         else:
             ended = not plays and self._flag("hasFinished")
         if ended:
@@ -295,9 +263,9 @@ class PulseStreamer(SyncSource):
 
     def _watch(self, run: _Run) -> None:
         """Count the sweeps of a program and see to it that the box answers, until the program is over."""
-        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(time.monotonic())):
+        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(now_s(self._clock))):
             try:
-                asked_s = time.monotonic()
+                asked_s = now_s(self._clock)
                 self._has_ended(run, asked_s, self._flag("isStreaming"))
             except DeviceError as error:
                 if not run.over.is_set():
@@ -317,11 +285,10 @@ class PulseStreamer(SyncSource):
     def _check_firmware(self) -> str:
         """The firmware's version; raises `ProtocolError` if it is too old."""
         version = str(self._rpc.call("getFirmwareVersion"))
-        try:
-            numbers = tuple(int(part) for part in version.split()[0].split(".")[:3])
-        except (ValueError, IndexError):
-            raise ProtocolError(f"{self.name}: no version in {version!r}; is this a Pulse Streamer 8/2?") from None
-        if numbers < OLDEST_FIRMWARE:
+        numbers = re.match(r"(\d+)\.(\d+)\.(\d+)", version)
+        if numbers is None:
+            raise ProtocolError(f"{self.name}: no version in {version!r}; is this a Pulse Streamer 8/2?")
+        if tuple(map(int, numbers.groups())) < OLDEST_FIRMWARE:
             oldest = ".".join(map(str, OLDEST_FIRMWARE))
             raise ProtocolError(f"{self.name}: firmware {version} is older than {oldest}; install a newer one")
         return version
@@ -334,30 +301,23 @@ class PulseStreamer(SyncSource):
                 "input and 'clock', then open it again"
             )
 
-    def _byte_order(self) -> Literal[">", "<"]:
-        """The byte order in which this firmware reads steps: clients 1.x send big-endian, 2.1 little-endian. Found out
-        with a dark sequence, which also shows whether the box reports waiting and ends as it is expected to."""
-        probe = GateSequence(np.array([(_PROBE_TICKS, 0, (0, 0))], STEP), 1, False)
-        orders: tuple[Literal[">", "<"], ...] = (">", "<")
-        for order in orders:
-            self._rpc.call("stream", probe.encoded(order), 1, LOW)
-            if self._flag("isStreaming") or self._flag("hasFinished"):
-                raise ProtocolError(
-                    f"{self.name}: firmware {self._firmware} says that a sequence which waits for its start plays or "
-                    "has ended; its programs could not be followed: report it"
-                )
-            self._rpc.call("startNow")
-            ends_at = time.monotonic() + _PROBE_S
-            while time.monotonic() < ends_at:
-                if self._flag("hasFinished"):
-                    self._lower()
-                    return order
-                time.sleep(_PROBE_PAUSE_S)
-            self._lower()
-        raise ProtocolError(
-            f"{self.name}: a dark test of {_PROBE_TICKS} ns did not end within {_PROBE_S:g} s; check the clock at its "
-            "input and 'clock', or power-cycle it"
-        )
+    def _check_timing(self) -> None:
+        """Play a dark sequence: it shows whether the box reads durations as they are meant (clients have sent them in
+        both byte orders), waits for its start, and reports its end."""
+        probe = compile_sequence(self.name, [_PROBE], 1, OutputPins(), external_hold=False)
+        self._rpc.call("stream", probe.encoded, 1, LOW)
+        waits = not self._flag("isStreaming") and not self._flag("hasFinished")
+        self._rpc.call("startNow")
+        ends_s = now_s(self._clock) + _PROBE_S
+        while not (ended := self._flag("hasFinished")) and now_s(self._clock) < ends_s:
+            self._clock.sleep(_PROBE_PAUSE_S)
+        self._lower()
+        if not (waits and ended):
+            what = f"did not end within {_PROBE_S:g} s" if waits else "did not wait for its start"
+            raise ProtocolError(
+                f"{self.name}: a dark test of 248 ns {what}; check the clock at its input and 'clock', power-cycle "
+                f"it, or report it with firmware {self._firmware}"
+            )
 
 
 KIND = Kind(config=PulseStreamerConfig, create=PulseStreamer)

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import LimitExceeded
 from drivers.interfaces import Pulse
 from drivers.interfaces.sync import HOLD_S
-from drivers.sync.prawndo import OutputPins
+from drivers.sync.board import OutputPins
 
 RESOLUTION_S = 1e-9
 """Unit of durations, and the sampling period of the digital outputs."""
@@ -51,9 +50,10 @@ class GateSequence:
         """Duration of one sweep, in seconds."""
         return float(self.steps["ticks"].sum(dtype=np.int64)) * RESOLUTION_S
 
-    def encoded(self, order: Literal[">", "<"]) -> str:
-        """The steps in base64, in that byte order."""
-        return base64.b64encode(self.steps.astype(STEP.newbyteorder(order)).tobytes()).decode()
+    @property
+    def encoded(self) -> str:
+        """The steps in base64."""
+        return base64.b64encode(self.steps.tobytes()).decode()
 
 
 def compile_sequence(

@@ -90,7 +90,7 @@ class SyncCase:
     """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close.
 
     waiting: what its status says while a program waits. plays: its outputs follow the program; of a stand-in they are
-    low for good.
+    low for good. step_s: long against the delays of its wire, so that the suite can look at each word.
     """
 
     device: SyncSource
@@ -99,3 +99,4 @@ class SyncCase:
     pins: Callable[[], int]
     waiting: str = "waiting"
     plays: bool = True
+    step_s: float = 0.01

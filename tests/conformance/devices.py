@@ -10,13 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.clock import VirtualClock
-from drivers.guard import Guard
+from drivers.clock import SystemClock, VirtualClock
+from drivers.guard import Guard, GuardLimits
 from drivers.interfaces import SyncSource
 from drivers.lasers.obis import ObisConfig
 from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
+from drivers.sync.pulsestreamer import PulseStreamerConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import DacModel, HeliosModel
 from sim_backend.wire.firmware.obis import ObisModel
@@ -25,7 +26,7 @@ from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
 from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import eventually, open_cobolt, open_obis, wire
 from tests.wire.scanners import opened
-from tests.wire.syncs import Board, board
+from tests.wire.syncs import Board, PulseBox, board, pulse_box
 
 Factory = Callable[[Path], AbstractContextManager[Any]]
 
@@ -81,25 +82,43 @@ def emulated_scanner(folder: Path, kind: str, make: Callable[[], DacModel]) -> I
         yield ScannerCase(device, lambda: model.moving(plugged.now_s()), let_pass)
 
 
-def _on_board(board: Board, device: SyncSource) -> SyncCase:
-    def trigger() -> None:
-        board.trigger.pulse(board.now_s + 1e-6, 10e-6)
-        board.clock.sleep(2e-6)
+def _on_board(board: Board | PulseBox, device: SyncSource, after_s: float = 1e-6, **settings: Any) -> SyncCase:
+    """after_s: until a scan marker comes."""
 
-    return SyncCase(device, board.clock, trigger, lambda: board.pins, waiting="running")
+    def trigger() -> None:
+        board.trigger.pulse(board.now_s + after_s, 10 * after_s)
+        board.clock.sleep(2 * after_s)
+
+    return SyncCase(device, board.clock, trigger, lambda: board.pins, **settings)
 
 
 @contextmanager
 def emulated_prawndo(folder: Path) -> Iterator[SyncCase]:
     with board() as wired, wired.open() as device:
-        yield _on_board(wired, device)
+        yield _on_board(wired, device, waiting="running")
 
 
 @contextmanager
 def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
     config = PrawnDoConfig(port="emulated:sync")
     with board(terminal=True) as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
-        yield _on_board(wired, guard.sync)
+        yield _on_board(wired, guard.sync, waiting="running")
+
+
+@contextmanager
+def emulated_pulse_streamer(folder: Path) -> Iterator[SyncCase]:
+    with pulse_box() as box, box.open() as device:
+        yield _on_board(box, device)
+
+
+@contextmanager
+def guarded_pulse_streamer(folder: Path) -> Iterator[SyncCase]:
+    """In the host's time, in which the driver counts sweeps."""
+    config = PulseStreamerConfig(port="emulated:sync")
+    box = PulseBox(clock=SystemClock())
+    limits = GuardLimits(first_frame_s=60.0)  # no SPAD gives frames
+    with box.server, Guard(sync=config, ports={"sync": box.server.endpoint}, limits=limits) as guard:
+        yield _on_board(box, guard.sync, 0.01, step_s=0.15)
 
 
 @contextmanager
@@ -133,4 +152,6 @@ SYNCS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="sync"),
     "prawndo": emulated_prawndo,
     "prawndo, guarded": guarded_prawndo,
+    "pulsestreamer": emulated_pulse_streamer,
+    "pulsestreamer, guarded": guarded_pulse_streamer,
 }

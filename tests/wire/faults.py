@@ -1,13 +1,17 @@
 """What can go wrong on a wire, on purpose: a seeded schedule decides for each reply which fault strikes it."""
 
+import socket
+import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
+from sim_backend.wire.serve.http import HttpServer, RpcModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb_model import STALL, Answer, Setup, Stall, UsbModel
 from sim_backend.wire.serve.wire_server import WireServer
@@ -126,6 +130,38 @@ class Faulty(WireServer[Any]):
 
 class FaultyTcpServer(Faulty, TcpServer):
     """A program that serves one client, over a faulty connection."""
+
+
+class FaultyHttpServer(HttpServer):
+    """A box that answers one question for each connection, over a faulty network."""
+
+    def __init__(self, model: RpcModel, *, faults: FaultSchedule | None = None, **settings: Any) -> None:
+        super().__init__(model, **settings)
+        self.faults = faults
+        self._stalled_until_s = 0.0
+
+    def answer(self, client: socket.socket, body: bytes) -> bytes | None:
+        """A late one is late to be heard or late to be answered. `Fault.LOST` is a connection that closes."""
+        if self.faults is None:
+            return super().answer(client, body)
+        with self.lock:
+            fault = self.faults.next()
+            if fault is Fault.STALL:
+                self._stalled_until_s = time.monotonic() + self.faults.stall_s
+            late_s = self.faults.late_s if fault is Fault.LATE and hash(body) % 2 else 0.0
+        if fault is Fault.HANG:
+            self.hang()
+        time.sleep(max(late_s, self._stalled_until_s - time.monotonic()))
+        answer = super().answer(client, body)
+        if fault is Fault.UNPLUG:
+            self.unplug()
+        elif answer is not None and fault is not None:
+            reply = b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(answer), answer)
+            for delay_s, data in self.faults.shape(fault if not late_s else None, reply):
+                time.sleep(delay_s)
+                with suppress(OSError):  # the client may have given up
+                    client.sendall(data)
+        return answer if fault is None else None
 
 
 _OUT_FAULTS = (Fault.LATE, Fault.LOST, Fault.STALL, Fault.UNPLUG, Fault.HANG)

@@ -1,4 +1,4 @@
-"""The real PrawnDO driver on an emulated wire."""
+"""The real drivers of a PrawnDO and of a Pulse Streamer on emulated wires."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -6,14 +6,17 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from drivers.clock import VirtualClock, now_s
+from drivers.clock import Clock, VirtualClock, now_s
 from drivers.interfaces import OUT_GATE, Pulse
 from drivers.registry import Surroundings
 from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import USUAL_TIMING, PrawnDoTiming
+from drivers.sync.pulsestreamer import PulseStreamer, PulseStreamerConfig
+from drivers.sync.pulsestreamer_rpc import CALL_S
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
+from sim_backend.wire.firmware.pulsestreamer import PulseStreamerModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.wire.faults import FaultSchedule
+from tests.wire.faults import FaultSchedule, FaultyHttpServer
 from tests.wire.serial_wire import SerialWire
 
 USB_BAUD = 8_000_000
@@ -37,6 +40,13 @@ class TriggerLine:
         if index >= 0 and self._edges[index][1]:
             return from_s
         return next((at for at, high in self._edges[index + 1 :] if high and at < until_s), None)
+
+    def low(self, from_s: float, until_s: float) -> float | None:
+        """The same for low."""
+        index = bisect_right(self._edges, from_s, key=lambda edge: edge[0]) - 1
+        if index < 0 or not self._edges[index][1]:
+            return from_s
+        return next((at for at, high in self._edges[index + 1 :] if not high and at < until_s), None)
 
 
 class Board:
@@ -70,6 +80,24 @@ class Board:
             self.model.advance(self.now_s)
             return self.model.outputs_at(self.now_s)
 
+    @property
+    def plays(self) -> bool:
+        return self.model.status in (1, 2)
+
+    @property
+    def held(self) -> list[tuple[int, int]]:
+        """The program in the memory without its end: outputs and ns."""
+        return [(outputs, 10 * cycles) for outputs, cycles in self.model.words[:-2]]
+
+    def changes(self, from_s: float) -> list[tuple[float, int]]:
+        with self.server.lock:
+            return self.model.changes(from_s, self.now_s)
+
+    def pass_time(self, seconds: float) -> None:
+        with self.server.lock:
+            self.clock.sleep(seconds)
+            self.model.tick(self.now_s)
+
     def open(self, timing: PrawnDoTiming = USUAL_TIMING, **config: Any) -> PrawnDo:
         made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
         endpoint = replace(self.server.endpoint, usb_ids=self.usb_ids)
@@ -79,5 +107,54 @@ class Board:
 @contextmanager
 def board(faults: FaultSchedule | None = None, **settings: Any) -> Iterator[Board]:
     made = Board(faults, **settings)
+    with made.server:
+        yield made
+
+
+class PulseBox:
+    """A Pulse Streamer with a trigger input. clock: of the box and of the driver's count of sweeps; calls travel in the
+    host's time."""
+
+    def __init__(self, faults: FaultSchedule | None = None, *, clock: Clock | None = None, **settings: Any) -> None:
+        self.clock = clock or VirtualClock()
+        self.trigger = TriggerLine()
+        self.model = PulseStreamerModel(self.trigger, low=self.trigger.low, **settings)
+        self.server = FaultyHttpServer(self.model, faults=faults, clock=self.clock)
+
+    @property
+    def now_s(self) -> float:
+        return now_s(self.clock)
+
+    @property
+    def pins(self) -> int:
+        with self.server.lock:
+            self.model.advance(self.now_s)
+            return self.model.outputs_at(self.now_s)
+
+    @property
+    def plays(self) -> bool:
+        with self.server.lock:
+            return bool(self.model.call("isStreaming", [], self.now_s))
+
+    @property
+    def held(self) -> None:
+        """Not looked at: what plays is."""
+
+    def changes(self, from_s: float) -> list[tuple[float, int]]:
+        with self.server.lock:
+            self.model.advance(self.now_s)
+            return self.model.changes(from_s, self.now_s)
+
+    def pass_time(self, seconds: float) -> None:
+        self.clock.sleep(seconds)
+
+    def open(self, call_s: float = CALL_S, **config: Any) -> PulseStreamer:
+        made = PulseStreamerConfig.model_validate({"port": "emulated:sync", **config})
+        return PulseStreamer(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), call_s)
+
+
+@contextmanager
+def pulse_box(faults: FaultSchedule | None = None, **settings: Any) -> Iterator[PulseBox]:
+    made = PulseBox(faults, **settings)
     with made.server:
         yield made

@@ -11,7 +11,7 @@ from drivers.errors import DeviceNotFound, LimitExceeded
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.interfaces.sync import HOLD_S
 from drivers.registry import kinds, lookup
-from drivers.sync.prawndo import OutputPins
+from drivers.sync.board import OutputPins
 from drivers.sync.pulsestreamer import CLOCKS, PulseStreamer, PulseStreamerConfig
 from drivers.sync.pulsestreamer_rpc import JsonRpc
 from drivers.sync.pulsestreamer_sequence import (
@@ -35,7 +35,7 @@ def compiled(*pulses: Pulse, repeats: int = 1, pins: OutputPins = USUAL, externa
 
 def sent(sequence: GateSequence) -> list[tuple[int, ...]]:
     """Duration in ns, channels and two analog outputs of each step, from the text that `stream` sends."""
-    return list(struct.iter_unpack(">IBhh", base64.b64decode(sequence.encoded(">"))))
+    return list(struct.iter_unpack(">IBhh", base64.b64decode(sequence.encoded)))
 
 
 # Config
@@ -122,7 +122,7 @@ def test_durations_are_whole_nanoseconds_and_long_words_are_several_steps() -> N
 
 def test_steps_are_sent_in_the_byte_order_that_the_box_reads() -> None:
     sequence = compiled(Pulse(OUT_GATE, 1e-6))
-    assert base64.b64decode(sequence.encoded(">")) == bytes((0, 0, 0x03, 0xE8, 2, 0, 0, 0, 0))
+    assert base64.b64decode(sequence.encoded) == bytes((0, 0, 0x03, 0xE8, 2, 0, 0, 0, 0))
     assert base64.b64decode(sequence.encoded("<")) == bytes((0xE8, 0x03, 0, 0, 2, 0, 0, 0, 0))
 
 

@@ -11,13 +11,16 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
-from tests.campaigns.devices import blanking, lasers, prawndo, scanners, spad512s, spb_usb
+from tests.campaigns.devices import blanking, lasers, scanners, spad512s, spb_usb, syncs
+from tests.campaigns.devices.prawndo import PRAWNDO
+from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "obis": partial(lasers.sequence, lasers.OBIS),
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
-    "prawndo": prawndo.sequence,
+    "prawndo": partial(syncs.sequence, PRAWNDO),
+    "pulsestreamer": partial(syncs.sequence, PULSESTREAMER),
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
     "spb-usb": spb_usb.sequence,
@@ -28,6 +31,7 @@ WATCHED = {
     "obis": "longest verb, s",
     "cobolt": "longest verb, s",
     "prawndo": "longest verb, s",
+    "pulsestreamer": "longest verb, s",
     "blanking": "largest error of a synchronised map, columns",
 }
 """Their worst figure; of the others it is the time of the longest sequence."""

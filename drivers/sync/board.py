@@ -1,0 +1,74 @@
+"""What boards that play patterns have in common: outputs on pins of the user's choice, and a start that fails dark."""
+
+import logging
+from dataclasses import dataclass
+from typing import Self
+
+from pydantic import model_validator
+
+from drivers.errors import DeviceError, WrongState
+from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, SyncSource
+from drivers.registry import KindConfig
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class OutputPins:
+    """The pins, counted from 0, that carry the outputs `OUT_*`."""
+
+    frame: int = 0
+    gate: int = 1
+    marker: int = 2
+
+    def levels(self, outputs: int) -> int:
+        """Levels of the pins for an OR of `OUT_*`."""
+        return sum(1 << pin for output, pin in self._pairs if outputs & output)
+
+    def outputs(self, levels: int) -> int:
+        """The OR of those `OUT_*` whose pins are high."""
+        return sum(output for output, pin in self._pairs if levels >> pin & 1)
+
+    @property
+    def _pairs(self) -> tuple[tuple[int, int], ...]:
+        return (OUT_FRAME, self.frame), (OUT_GATE, self.gate), (OUT_MARKER, self.marker)
+
+
+class BoardConfig(KindConfig):
+    """Config of a board whose outputs may be on any of its pins."""
+
+    frame_output: int
+    gate_output: int
+    marker_output: int
+
+    @model_validator(mode="after")
+    def _check_outputs(self) -> Self:
+        used = (self.frame_output, self.gate_output, self.marker_output)
+        for output in used:
+            if used.count(output) > 1:
+                raise ValueError(
+                    f"output {output} has two uses; give frame_output, gate_output and marker_output one each"
+                )
+        return self
+
+    @property
+    def pins(self) -> OutputPins:
+        """The pins that carry the outputs."""
+        return OutputPins(self.frame_output, self.gate_output, self.marker_output)
+
+
+class SyncBoard(SyncSource):
+    """A sync source that is a board at a port: it may have started although its answer did not arrive."""
+
+    def run(self) -> None:
+        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves."""
+        try:
+            super().run()
+        except WrongState:
+            raise  # nothing was sent
+        except BaseException:
+            try:
+                self._do_abort()
+            except DeviceError as error:
+                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
+            raise

@@ -1,0 +1,203 @@
+"""Random faults on the wire of a sync source.
+
+What a verb claims is held against the outputs themselves. After `abort` or `gate_low` has returned all are low and stay
+low, whatever scan markers come. After `run` has returned the program comes out as it was written, and as often. A
+status of low outputs is one. A verb in a state that does not allow it is rightly refused.
+"""
+
+import random
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from drivers.errors import DeviceError
+from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse, SyncSource
+from tests.campaigns.outcomes import Ending, Verbs
+from tests.wire.faults import Fault, FaultSchedule
+
+VERBS = 6
+LOOK_S = 0.01
+"""So long outputs that were taken low are looked at."""
+TOLERANCE_S = 2e-8
+
+
+class Bench(Protocol):
+    """A source on its wire, with a look from outside."""
+
+    server: Any
+
+    def open(self, timing: Any) -> SyncSource: ...
+    @property
+    def now_s(self) -> float: ...
+    @property
+    def pins(self) -> int: ...
+    @property
+    def plays(self) -> bool:
+        """Whether it plays, or waits within a program."""
+
+    @property
+    def held(self) -> list[tuple[int, int]] | None:
+        """The program in its memory, outputs and ns of each word; None: it is not looked at."""
+
+    def changes(self, from_s: float) -> list[tuple[float, int]]:
+        """The outputs at a time and all changes since."""
+
+    def pass_time(self, seconds: float) -> None: ...
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A sync source under test. timing: of its driver. deadline_s: for one verb, on the bench's clock.
+
+    bench: its wire with these faults; may also leave it as a dead host has. waits: half of the programs wait for scan
+    markers, which come by themselves. interrupts: half of the runs are interrupted.
+    """
+
+    bench: Callable[[FaultSchedule, random.Random], Bench]
+    timing: Any
+    deadline_s: float
+    late_s: float
+    stall_s: float
+    kinds: tuple[Fault, ...] = tuple(Fault)
+    waits: bool = False
+    interrupts: bool = False
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A program that was asked for. words: outputs and ns."""
+
+    words: tuple[tuple[int, int], ...]
+    repeats: int
+    waits: bool
+
+
+class Sequence:
+    """One source, one schedule of faults, a few verbs."""
+
+    def __init__(self, subject: Subject, seed: int) -> None:
+        self._subject, self._random = subject, random.Random(seed)
+        self._faults = FaultSchedule(
+            seed, 0.15, subject.kinds, skip=self._random.randrange(12), most=4, late_s=subject.late_s,
+            stall_s=subject.stall_s,
+        )  # fmt: skip
+        self._bench = subject.bench(self._faults, self._random)
+        self._verb = Verbs(subject.deadline_s, lambda: self._bench.now_s)
+        self._device: SyncSource | None = None
+        self._asked: Asked | None = None
+        self._begun_s: float | None = None
+        """Time of the last `run`, if nothing has ended its program since."""
+
+    def run(self) -> Ending:
+        with self._bench.server:
+            ended = self._verb.ending(self._some_verbs)
+        return ended._replace(struck=[fault.value for fault in self._faults.struck])
+
+    def _some_verbs(self) -> None:
+        self._verb("open", self._open)
+        if (device := self._device) is None:
+            return
+        verbs = (self._program, self._run, self._lower, self._lower, self._status, self._play)
+        for _ in range(VERBS):
+            verb = self._random.choice(verbs)
+            self._verb(verb.__name__, lambda verb=verb: verb(device))  # type: ignore[misc]
+        if self._verb("close", device.close):
+            self._require_low()
+
+    def _open(self) -> None:
+        self._device = self._bench.open(self._subject.timing)
+        self._require_low()
+
+    def _program(self, device: SyncSource) -> None:
+        gate_ns = 10 * self._random.randrange(5, 10**6)
+        words = ((OUT_FRAME, 10**6), (OUT_GATE, gate_ns), (0, 2 * 10**6))
+        asked = Asked(words, self._random.choice((1, 10, 1000)), self._subject.waits and self._random.random() < 0.5)
+        pulses = [Pulse(outputs, 1e-9 * ns) for outputs, ns in words]
+        device.program([Pulse(0, None), *pulses] if asked.waits else pulses, asked.repeats)
+        self._asked = asked
+        if (held := self._bench.held) is not None:
+            assert held == list(words) * asked.repeats, f"the board holds {held[:4]}... ({len(held)})"
+
+    def _run(self, device: SyncSource) -> None:
+        self._begun_s, begun_s = None, self._bench.now_s
+        if self._subject.interrupts and self._random.random() < 0.5:
+            self._interrupted_run(device)
+            return
+        device.run()
+        self._begun_s = begun_s
+        self._require_program(device)
+
+    def _interrupted_run(self, device: SyncSource) -> None:
+        """Let another thread take outputs low meanwhile: if it says that they are, they are."""
+        lowered: list[bool] = []
+
+        def lower() -> None:
+            self._bench.pass_time(self._random.uniform(0, 0.005))
+            with suppress(DeviceError):
+                device.abort()
+                lowered.append(True)
+
+        thread = threading.Thread(target=lower)
+        thread.start()
+        begun_s = self._bench.now_s
+        try:
+            device.run()
+        finally:
+            came_first = not lowered
+            thread.join()
+        if came_first and lowered:
+            self._require_low()
+        elif not lowered:
+            self._begun_s = begun_s
+
+    def _lower(self, device: SyncSource) -> None:
+        self._begun_s = None
+        self._random.choice((device.abort, device.gate_low))()
+        self._require_low()
+
+    def _status(self, device: SyncSource) -> None:
+        bench = self._bench
+        played = bench.plays
+        status = device.status
+        assert status.outputs in (None, bench.pins), f"{status}, outputs are {bench.pins}"
+        plays = bench.plays  # a program may end while it is asked for
+        assert (status.state == "running") in (played, plays), f"{status}, it plays: {played}, then {plays}"
+        self._require_program(device)
+
+    def _play(self, device: SyncSource) -> None:
+        self._bench.pass_time(self._random.uniform(0, 0.02))
+        self._require_program(device)
+
+    def _require_program(self, device: SyncSource) -> None:
+        """AssertionError where something else has come out since `run` than the program, or more of it."""
+        if self._begun_s is None or self._asked is None:
+            return
+        (_, first), *changes = self._bench.changes(self._begun_s)
+        assert first == 0, f"outputs were {first} before `run`"
+        words = self._asked.words
+        wrong = None
+        for index, (at_s, outputs) in enumerate(changes):
+            since_s = at_s - changes[index - 1][0] if index % len(words) else None
+            expected, lasts_ns = words[index % len(words)][0], words[index % len(words) - 1][1]
+            if outputs != expected or (since_s is not None and abs(since_s - 1e-9 * lasts_ns) > TOLERANCE_S):
+                wrong = f"word {index} is {outputs} after {since_s} s, not {expected} after {lasts_ns} ns"
+                break
+        if wrong is None and not self._asked.waits and len(changes) > self._asked.repeats * len(words):
+            wrong = f"{len(changes)} words for {self._asked.repeats} repeats"
+        if wrong is not None and index == len(changes) - 1 and outputs == 0:
+            # Taken low by the driver itself: the device was lost, or sweeps were counted late.
+            wrong = None if self._asked.waits or getattr(device, "port_lost", False) else wrong
+        assert wrong is None, wrong
+
+    def _require_low(self) -> None:
+        assert not self._bench.pins, f"outputs are {self._bench.pins}"
+        since_s = self._bench.now_s
+        self._bench.pass_time(LOOK_S)
+        changes = self._bench.changes(since_s)
+        assert not any(outputs for _, outputs in changes), f"outputs went up again: {changes[:3]}"
+
+
+def sequence(subject: Subject, seed: int) -> Ending:
+    return Sequence(subject, seed).run()
