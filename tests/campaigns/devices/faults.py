@@ -14,12 +14,14 @@ from functools import partial
 from tests.campaigns.devices import blanking, lasers, scanners, spad512s, spb_usb, syncs
 from tests.campaigns.devices.prawndo import PRAWNDO
 from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
+from tests.campaigns.devices.teensy import TEENSY
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "obis": partial(lasers.sequence, lasers.OBIS),
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
     "prawndo": partial(syncs.sequence, PRAWNDO),
+    "teensy": partial(syncs.sequence, TEENSY),
     "pulsestreamer": partial(syncs.sequence, PULSESTREAMER),
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
@@ -31,6 +33,7 @@ WATCHED = {
     "obis": "longest verb, s",
     "cobolt": "longest verb, s",
     "prawndo": "longest verb, s",
+    "teensy": "longest verb, s",
     "pulsestreamer": "longest verb, s",
     "blanking": "largest error of a synchronised map, columns",
 }
