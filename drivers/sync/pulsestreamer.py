@@ -67,6 +67,8 @@ SOFTWARE, RISING = 1, 2
 """Starts of a sequence (`setTrigger`): by `startNow`, or at a rising edge of the trigger input."""
 AUTO, MANUAL = 0, 1
 """Whether the trigger is armed again after a sequence, or not."""
+CHECK_S = 0.2
+"""Time after which a box that waits for the scan marker is asked whether it still does: a restart loses its program."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
 
 _PROBE = Pulse(0, 248e-9)
@@ -76,10 +78,12 @@ _PROBE_S, _PROBE_PAUSE_S = 1.0, 0.01
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A program that was started. count: None if the box itself ends it."""
+    """A program that was started. count: None if the box itself ends it. aborts: how often outputs were taken low
+    before."""
 
     waits: bool
     count: SweepCount | None
+    aborts: int
     over: threading.Event = field(default_factory=threading.Event)
 
 
@@ -162,7 +166,8 @@ class PulseStreamer(SyncBoard):
 
     @property
     def resolution_s(self) -> float:
-        """1 ns. The trigger is sampled every 8 ns, so a sweep begins 61 to 69 ns after the scan marker."""
+        """1 ns. The box makes a sequence a multiple of 8 ns long, with its last levels, and samples its trigger every 8
+        ns: a sweep begins 61 to 69 ns after the scan marker."""
         return RESOLUTION_S
 
     @property
@@ -191,15 +196,14 @@ class PulseStreamer(SyncBoard):
                 self._safe = False
                 step("constant", (0, sequence.rest, 0, 0))
                 step("setTrigger", start, MANUAL if once else AUTO)
-                found = step("getTriggerStart")
-                if found != start:  # a sequence for the trigger IMMEDIATE would start at once
-                    raise DeviceFault(f"{self.name}: its trigger is {found!r}, not {start}; power-cycle it")
+                self._require_no_abort(aborts)
+                self._check_trigger(start)  # a sequence for the trigger IMMEDIATE would start at once
                 count = None if once else SweepCount(sequence.sweeps, sequence.duration_s, now_s(self._clock))
                 runs, final = 1 if sequence.waits else sequence.sweeps, 0 if once else sequence.rest
                 step("stream", sequence.encoded, runs, (0, final, 0, 0))
                 if not sequence.waits:
                     step("startNow")
-                self._run = run = _Run(sequence.waits, count)
+                self._run = run = _Run(sequence.waits, count, aborts)
                 self._require_no_abort(aborts)
         except WrongState:
             self._lower()  # the thread that interrupted may have failed to
@@ -255,6 +259,8 @@ class PulseStreamer(SyncBoard):
             ended = run.count.take(asked_s, now_s(self._clock), plays)
         else:
             ended = not plays and self._flag("hasFinished")
+            if not (plays or ended or run.waits) and self._aborts == run.aborts:
+                raise DeviceFault(f"{self.name}: its program is gone: it has restarted, or another program uses it")
         if ended:
             with self._lock:
                 if self._run is run:
@@ -263,10 +269,15 @@ class PulseStreamer(SyncBoard):
 
     def _watch(self, run: _Run) -> None:
         """Count the sweeps of a program and see to it that the box answers, until the program is over."""
+        checked_s = now_s(self._clock)
         while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(now_s(self._clock))):
             try:
                 asked_s = now_s(self._clock)
-                self._has_ended(run, asked_s, self._flag("isStreaming"))
+                plays = self._flag("isStreaming")
+                ended = self._has_ended(run, asked_s, plays)
+                if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
+                    self._check_trigger(RISING)
+                    checked_s = asked_s
             except DeviceError as error:
                 if not run.over.is_set():
                     _log.error("%s: while a program runs: %s", self.name, error)
@@ -274,6 +285,14 @@ class PulseStreamer(SyncBoard):
                     with suppress(DeviceError):
                         self._lower()
                 return
+
+    def _check_trigger(self, wanted: int) -> None:
+        found = self._rpc.call("getTriggerStart")
+        if found != wanted:
+            raise DeviceFault(
+                f"{self.name}: its trigger is {found!r}, not {wanted}: it has restarted, or another program uses it; "
+                "end that program and open it again"
+            )
 
     def _flag(self, method: str) -> bool:
         """A yes or no of the box, which says true, false, 1 or 0."""

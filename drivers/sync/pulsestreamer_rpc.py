@@ -87,9 +87,9 @@ class JsonRpc:
                     link.connect(self._peer)
                     reached = True
                     link.sendall(head.encode() + body)
-                    answer = http.client.HTTPResponse(link)
-                    answer.begin()
-                    return answer.read(_MOST_BYTES)
+                    with http.client.HTTPResponse(link) as answer:
+                        answer.begin()
+                        return answer.read(_MOST_BYTES)
             except TimeoutError:
                 where = f"within {self._call_s:g} s at {self._address}"
                 if reached:

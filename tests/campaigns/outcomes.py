@@ -56,12 +56,12 @@ def ending(act: Callable[[], str], now_s: Callable[[], float], deadline_s: float
 
 
 class Verbs:
-    """Verbs of one sequence, each with so much time on a clock."""
+    """Verbs of one sequence, each with so much time on a clock. ends: how those so far ended."""
 
     def __init__(self, deadline_s: float, now_s: Callable[[], float]) -> None:
         self._deadline_s = deadline_s
         self._now_s = now_s
-        self._ends: list[str] = []
+        self.ends: list[str] = []
         self._longest_s = 0.0
 
     def __call__(self, name: str, act: Callable[[], object]) -> bool:
@@ -72,7 +72,7 @@ class Verbs:
             return DONE
 
         (end,), wrong, took_s, _ = ending(done, self._now_s, self._deadline_s)
-        self._ends.append(end)
+        self.ends.append(end)
         self._longest_s = max(self._longest_s, took_s)
         assert wrong is None, f"{name}: {wrong}"
         return end == DONE
@@ -86,7 +86,7 @@ class Verbs:
             wrong = str(error)
         except Exception as error:
             wrong = f"outside of any verb: {type(error).__name__}: {error}"
-        return Ending(self._ends, wrong, self._longest_s)
+        return Ending(self.ends, wrong, self._longest_s)
 
 
 def campaign(sequence: Callable[[int], Ending], seeds: range, pool: Executor) -> Outcomes:

@@ -30,6 +30,8 @@ from drivers.clock import SystemClock
 from drivers.interfaces import OUT_GATE
 from drivers.registry import Surroundings
 from sim_backend.wire.emulated_world import EmulatedWorld, EmulatedWorldConfig
+from sim_backend.wire.firmware.helios import BLUE
+from sim_backend.wire.firmware.pulsestreamer import PulseStreamerModel
 from tests.system.small_rig import calibration, emulated
 from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 
@@ -47,7 +49,8 @@ class ScanFailedError(Exception):
 
 
 def light(world: EmulatedWorld, from_s: float, until_s: float) -> list[tuple[float, float]]:
-    """(start, end) of every period with light (emission AND gate) in [from_s, until_s], ascending.
+    """(start, end) of every period with light (emission AND gate) in [from_s, until_s], ascending. Behind a Pulse
+    Streamer, whose rig has `hold: external`, light also needs the scan marker.
 
     Times are the host's, at most until now; only the last `KEPT_S` are known.
     """
@@ -56,7 +59,13 @@ def light(world: EmulatedWorld, from_s: float, until_s: float) -> list[tuple[flo
         gate = [(at, 0, bool(word & OUT_GATE)) for at, word in world.sync.changes(from_s, until_s)]
     with world._emission_lock:
         emission = [(max(at, from_s), 1, power_w > 0) for at, power_w in world._emission if at < until_s]
-    levels, begun_s, found = [False, False], 0.0, []
+    levels, begun_s, found = [False, False, True], 0.0, []
+    if isinstance(world.sync, PulseStreamerModel):
+        at = np.arange(from_s, until_s, STEP_S)
+        with world.scanner_plug.lock:
+            world.scanner.advance(until_s)
+            high = world.scanner.history.level(BLUE, at) > 0
+        gate += [(float(at[index]), 2, bool(high[index])) for index in np.flatnonzero(np.diff(high, prepend=~high[:1]))]
     for at_s, which, level in [*sorted(gate + emission), (until_s, 0, False)]:
         was_lit = all(levels)
         levels[which] = level

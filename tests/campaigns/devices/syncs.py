@@ -121,6 +121,8 @@ class Sequence:
             assert held == list(words) * asked.repeats, f"the board holds {held[:4]}... ({len(held)})"
 
     def _run(self, device: SyncSource) -> None:
+        if self._asked is None:
+            self._program(device)
         self._begun_s, begun_s = None, self._bench.now_s
         self._bench.pass_time(1e-6)
         if self._subject.interrupts and self._random.random() < 0.5:
@@ -135,7 +137,7 @@ class Sequence:
         lowered: list[bool] = []
 
         def lower() -> None:
-            self._bench.pass_time(self._random.uniform(0, 0.005))
+            self._bench.pass_time(self._random.uniform(0, 0.004))
             with suppress(DeviceError):
                 device.abort()
                 lowered.append(True)
@@ -194,8 +196,10 @@ class Sequence:
         if wrong is None and not self._asked.waits and len(changes) > self._asked.repeats * len(words):
             wrong = f"{len(changes)} words for {self._asked.repeats} repeats"
         if wrong is not None and index == len(changes) - 1 and outputs == 0:
-            # Taken low by the driver itself: the device was lost, or sweeps were counted late.
-            wrong = None if self._asked.waits or getattr(device, "port_lost", False) else wrong
+            # Taken low by the driver itself: the device was lost, or sweeps were counted late. Or by an earlier verb
+            # that was told to have failed: its question is heard late.
+            lost = getattr(device, "port_lost", False) or "DeviceTimeout" in self._verb.ends
+            wrong = None if self._asked.waits or lost else wrong
         assert wrong is None, wrong
 
     def _require_low(self, which: int = ~0) -> None:
