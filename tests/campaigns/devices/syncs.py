@@ -1,8 +1,8 @@
 """Random faults on the wire of a sync source.
 
 What a verb claims is held against the outputs themselves. After `abort` has returned all are low and stay low, whatever
-scan markers come; after `gate_low` the gate is. After `run` has returned the program comes out as it was written, and as often. A
-status of low outputs is one. A verb in a state that does not allow it is rightly refused.
+scan markers come; after `gate_low` the gate is. After `run` has returned the program comes out as it was written, and
+as often. A status of low outputs is one. A verb in a state that does not allow it is rightly refused.
 """
 
 import random
