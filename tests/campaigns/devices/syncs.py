@@ -135,8 +135,10 @@ class Sequence:
     def _interrupted_run(self, device: SyncSource) -> None:
         """Let another thread take outputs low meanwhile: if it says that they are, they are."""
         lowered: list[bool] = []
+        begun = threading.Event()
 
         def lower() -> None:
+            begun.wait()
             self._bench.pass_time(self._random.uniform(0, 0.004))
             with suppress(DeviceError):
                 device.abort()
@@ -147,6 +149,7 @@ class Sequence:
         self._bench.pass_time(1e-6)
         thread.start()
         try:
+            begun.set()
             device.run()
         finally:
             came_first = not lowered
