@@ -21,6 +21,8 @@ USB_IDS = (0x16C0, 0x0483)
 """Vendor and product of any Teensy with USB type Serial, whatever its sketch."""
 REPLY_S = 1.0
 """Deadline for a reply. One over USB takes 1 ms; the rest is a margin for a busy host."""
+OPENING = 3
+"""The first reply may take so many times as long: a host that starts a scan is busy."""
 TRIES = 3
 """Number of times that a command is sent which may come twice."""
 DONE = re.compile(r"ok( \d+)?")
@@ -52,6 +54,7 @@ class TeensyLine:
         if found not in (None, USB_IDS):
             ids = ", not ".join(f"{vendor:04x}:{product:04x}" for vendor, product in (found or USB_IDS, USB_IDS))
             raise ProtocolError(f"{self._name}: {self.port.path} is USB device {ids}; correct 'port'")
+        usual_s, self._reply_s = self._reply_s, OPENING * self._reply_s
         try:
             self.lower("abort")
         except DeviceTimeout:
@@ -61,6 +64,8 @@ class TeensyLine:
                     f"(it says {self._heard[:40].decode('ascii', 'replace')!r}); upload that, or correct 'port'"
                 ) from None
             raise
+        finally:
+            self._reply_s = usual_s
         return self.ask("id", IDENTITY, TRIES)
 
     def ask(self, command: str, form: re.Pattern[str], tries: int = 1) -> re.Match[str]:

@@ -19,13 +19,14 @@ from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, obis
 from drivers.registry import Surroundings
 from drivers.spads import spad512s, spb_usb
-from drivers.sync import prawndo
+from drivers.sync import prawndo, teensy
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire import syncs
 from tests.wire.lasers import bring_up, wire
 from tests.wire.spb_device import model
 from tests.wire.syncs import board
@@ -55,6 +56,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         places = {
             cobolt: replace(at_laser, ports={"laser": at_laser.ports["laser"]}),
             prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
+            teensy: stack.enter_context(syncs.teensy()).surroundings,
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
         }
         for module, surroundings in places.items():

@@ -167,7 +167,7 @@ def _other_version(wire: TeensyBoard) -> None:
     [
         (lambda w: setattr(w, "usb_ids", (0x2E8A, 0xA)), ProtocolError, "USB device 2e8a:000a, not 16c0:0483; corr"),
         (lambda w: setattr(w.server, "model", Babble()), ProtocolError, r"not the firmware .*'hello there'\); upload"),
-        (lambda w: setattr(w.server, "model", Silent()), DeviceTimeout, "did not answer 'abort' within 1 s on /dev"),
+        (lambda w: setattr(w.server, "model", Silent()), DeviceTimeout, "did not answer 'abort' within 3 s on /dev"),
         (_other_version, ProtocolError, "speaks version 2 .* not 1; upload config/firmware/teensy/teensy.ino"),
         (lambda w: w.model.short(OUT_GATE, 0.0), DeviceFault, "read back 0x2 after opening, not low; turn the laser"),
     ],
