@@ -134,9 +134,9 @@ class TeensyBoard(Board):
     def held(self) -> None:
         """Not looked at: what plays is."""
 
-    def open(self, reply_s: float = REPLY_S, **config: Any) -> Teensy:  # type: ignore[override]
+    def open(self, timing: float = REPLY_S, **config: Any) -> Teensy:  # type: ignore[override]
         made = TeensyConfig.model_validate({"port": "emulated:sync", **config})
-        return Teensy(made, self.surroundings, reply_s)
+        return Teensy(made, self.surroundings, timing)
 
 
 @contextmanager
