@@ -116,7 +116,7 @@ class Sequence:
         asked = Asked(words, self._random.choice((1, 10, 1000)), self._subject.waits and self._random.random() < 0.5)
         pulses = [Pulse(outputs, 1e-9 * ns) for outputs, ns in words]
         device.program([Pulse(0, None), *pulses] if asked.waits else pulses, asked.repeats)
-        self._asked = asked
+        self._asked, self._begun_s = asked, None
         if (held := self._bench.held) is not None:
             assert held == list(words) * asked.repeats, f"the board holds {held[:4]}... ({len(held)})"
 
