@@ -6,7 +6,7 @@ from typing import Self
 
 from pydantic import model_validator
 
-from drivers.errors import DeviceError, WrongState
+from drivers.errors import DeviceError, DeviceFault, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, SyncSource
 from drivers.registry import KindConfig
 
@@ -60,10 +60,27 @@ class BoardConfig(KindConfig):
 class SyncBoard(SyncSource):
     """A sync source that is a board at a port: it may have started although its answer did not arrive."""
 
+    _lowered = 0
+    """Number of calls of `gate_low` and `abort`."""
+
+    def gate_low(self) -> None:
+        """See `SyncSource`. A `run` on its way is ended, too."""
+        self._lowered += 1
+        super().gate_low()
+
+    def abort(self) -> None:
+        """See `SyncSource`. A `run` on its way is ended, too."""
+        self._lowered += 1
+        super().abort()
+
     def run(self) -> None:
-        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves."""
+        """Play the program from its first word. If that fails in any way, or another thread has called `gate_low` or
+        `abort` meanwhile, all outputs are low when the error leaves."""
+        lowered = self._lowered
         try:
             super().run()
+            if self._lowered != lowered:
+                raise DeviceFault(f"{self.name}: run was ended by gate_low or abort; run again")
         except WrongState:
             raise  # nothing was sent
         except BaseException:

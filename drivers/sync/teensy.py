@@ -1,9 +1,8 @@
 """A Teensy 4.0 or 4.1 with this project's firmware: three outputs, 10 ns steps, repeats, a trigger, pins read back.
 
 Protocol: docs/reference/teensy.md, version 1. The board itself ends a held pulse when the scan marker falls. It takes
-its outputs low when the port closes, so also when the process that holds it dies. Its watchdog is for a computer that
-freezes with the port open, and for a port that another process, such as a fork, still holds open: Linux lowers DTR only
-with the last one (tty_port_close_start in drivers/tty/tty_port.c).
+its outputs low when the port closes, so usually when the process that holds it dies. Where the board does not learn of
+that, its watchdog does the same: a computer that freezes, or a port that another process still holds open.
 
 The driver's own thread feeds the watchdog, since nobody else asks a sync source regularly, neither a notebook nor the
 guard. The guard watches the application, and the application the guard, so this thread need not: it ends with its
@@ -21,10 +20,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError, WrongState
-from drivers.interfaces import HOLD_S, OUT_GATE, Pulse, SyncSource, SyncStatus
+from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
+from drivers.interfaces import HOLD_S, Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.sync.board import SyncBoard
 from drivers.sync.teensy_line import DONE, REPLY_S, STATUS, TRIES, TeensyLine
 from drivers.transports.endpoints import resolve
 from drivers.transports.serial_port import SerialPort
@@ -95,7 +95,7 @@ class TeensyConfig(KindConfig):
     ] = WATCHDOG_S
 
 
-class Teensy(SyncSource):
+class Teensy(SyncBoard):
     """A Teensy. Opening it first takes all outputs low, whatever the board was doing."""
 
     def __init__(self, config: TeensyConfig, surroundings: Surroundings, reply_s: float = REPLY_S) -> None:
@@ -103,7 +103,6 @@ class Teensy(SyncSource):
         self._watchdog_s = config.watchdog
         self._loaded = False
         self._over = threading.Event()
-        self._lowered = 0
         port = SerialPort(self.name, resolve(config.port, surroundings.ports), surroundings.tap)
         self._line = TeensyLine(self.name, port, reply_s)
         try:
@@ -114,6 +113,7 @@ class Teensy(SyncSource):
                     "upload config/firmware/teensy/teensy.ino"
                 )
             self._serial, self._board = str(serial), BoardLimits(self.name, *map(int, limits))
+            self._check_low(~0, "opening")
         except BaseException:
             port.close()
             raise
@@ -156,23 +156,6 @@ class Teensy(SyncSource):
         """Whether the port is gone, found out without sending anything. May be called from any thread."""
         return self._line.port.lost
 
-    def run(self) -> None:
-        """Play the program from its first word. If that fails in any way, all outputs are low when the error leaves:
-        the board may have started although its answer did not arrive, or another thread has taken outputs low."""
-        lowered = self._lowered
-        try:
-            super().run()
-            if self._lowered != lowered:
-                raise DeviceFault(f"{self.name}: run was ended by gate_low or abort; run again")
-        except WrongState:
-            raise  # nothing was sent
-        except BaseException:
-            try:
-                self._line.lower("abort", ~0)
-            except DeviceError as error:
-                _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
-            raise
-
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """4294967295 times whatever fits the memory once."""
         return MOST if len(pulses) <= self._board.words else 0
@@ -194,12 +177,10 @@ class Teensy(SyncSource):
         threading.Thread(target=_feed_watchdog, args=feeding, name="Teensy watchdog", daemon=True).start()
 
     def _do_gate_low(self) -> None:
-        self._lowered += 1
-        self._line.lower("low", OUT_GATE)
+        self._line.lower("low")
 
     def _do_abort(self) -> None:
-        self._lowered += 1
-        self._line.lower("abort", ~0)
+        self._line.lower("abort")
 
     def _do_status(self) -> SyncStatus:
         return self._line.status()

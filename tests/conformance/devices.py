@@ -20,6 +20,7 @@ from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
 from drivers.sync.pulsestreamer import PulseStreamerConfig
+from drivers.sync.teensy import TeensyConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import DacModel, HeliosModel
@@ -31,7 +32,7 @@ from tests.wire.etherdream import let_pass, open_etherdream, turning, wired
 from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
 from tests.wire.scanners import opened
-from tests.wire.syncs import Board, PulseBox, board, pulse_box
+from tests.wire.syncs import Board, PulseBox, board, pulse_box, teensy
 
 Factory = Callable[[Path], AbstractContextManager[Any]]
 
@@ -125,6 +126,19 @@ def guarded_prawndo(folder: Path) -> Iterator[SyncCase]:
 
 
 @contextmanager
+def emulated_teensy(folder: Path) -> Iterator[SyncCase]:
+    with teensy() as wired, wired.open() as device:
+        yield _on_board(wired, device)
+
+
+@contextmanager
+def guarded_teensy(folder: Path) -> Iterator[SyncCase]:
+    config = TeensyConfig(port="emulated:sync")
+    with teensy(terminal=True) as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
+        yield _on_board(wired, guard.sync)
+
+
+@contextmanager
 def emulated_pulse_streamer(folder: Path) -> Iterator[SyncCase]:
     with pulse_box() as box, box.open() as device:
         yield _on_board(box, device)
@@ -178,6 +192,8 @@ SYNCS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="sync"),
     "prawndo": emulated_prawndo,
     "prawndo, guarded": guarded_prawndo,
+    "teensy": emulated_teensy,
+    "teensy, guarded": guarded_teensy,
     "pulsestreamer": emulated_pulse_streamer,
     "pulsestreamer, guarded": guarded_pulse_streamer,
 }

@@ -1,4 +1,4 @@
-"""The real drivers of a PrawnDO and of a Pulse Streamer on emulated wires."""
+"""The real drivers of a PrawnDO, a Teensy and a Pulse Streamer on emulated wires."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -13,8 +13,11 @@ from drivers.sync.prawndo import PrawnDo, PrawnDoConfig
 from drivers.sync.prawndo_line import USUAL_TIMING, PrawnDoTiming
 from drivers.sync.pulsestreamer import PulseStreamer, PulseStreamerConfig
 from drivers.sync.pulsestreamer_rpc import CALL_S
+from drivers.sync.teensy import Teensy, TeensyConfig
+from drivers.sync.teensy_line import REPLY_S
 from sim_backend.wire.firmware.prawndo import PrawnDoModel
 from sim_backend.wire.firmware.pulsestreamer import PulseStreamerModel
+from sim_backend.wire.firmware.teensy import TeensyModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import FaultSchedule, FaultyHttpServer
 from tests.wire.serial_wire import SerialWire
@@ -64,11 +67,14 @@ class Board:
         self.usb_ids = usb_ids
         self.clock = VirtualClock()
         self.trigger = TriggerLine()
-        self.model = PrawnDoModel(self.trigger, **settings)
+        self.model: Any = self.make(**settings)
         settings = {"clock": self.clock, "baud": USB_BAUD}
         self.server: SerialServer = (
             SerialServer(self.model, **settings) if terminal else SerialWire(self.model, faults=faults, **settings)
         )
+
+    def make(self, **settings: Any) -> Any:
+        return PrawnDoModel(self.trigger, **settings)
 
     @property
     def now_s(self) -> float:
@@ -78,35 +84,64 @@ class Board:
     def pins(self) -> int:
         with self.server.lock:
             self.model.advance(self.now_s)
-            return self.model.outputs_at(self.now_s)
+            return int(self.model.outputs_at(self.now_s))
 
     @property
     def plays(self) -> bool:
         return self.model.status in (1, 2)
 
     @property
-    def held(self) -> list[tuple[int, int]]:
+    def held(self) -> list[tuple[int, int]] | None:
         """The program in the memory without its end: outputs and ns."""
         return [(outputs, 10 * cycles) for outputs, cycles in self.model.words[:-2]]
 
     def changes(self, from_s: float) -> list[tuple[float, int]]:
         with self.server.lock:
-            return self.model.changes(from_s, self.now_s)
+            return list(self.model.changes(from_s, self.now_s))
 
     def pass_time(self, seconds: float) -> None:
         with self.server.lock:
             self.clock.sleep(seconds)
             self.model.tick(self.now_s)
 
+    @property
+    def surroundings(self) -> Surroundings:
+        return Surroundings(self.clock, None, 0, {"sync": replace(self.server.endpoint, usb_ids=self.usb_ids)})
+
     def open(self, timing: PrawnDoTiming = USUAL_TIMING, **config: Any) -> PrawnDo:
         made = PrawnDoConfig.model_validate({"port": "emulated:sync", **config})
-        endpoint = replace(self.server.endpoint, usb_ids=self.usb_ids)
-        return PrawnDo(made, Surroundings(self.clock, None, 0, {"sync": endpoint}), timing)
+        return PrawnDo(made, self.surroundings, timing)
 
 
 @contextmanager
 def board(faults: FaultSchedule | None = None, **settings: Any) -> Iterator[Board]:
     made = Board(faults, **settings)
+    with made.server:
+        yield made
+
+
+class TeensyBoard(Board):
+    """A Teensy in place of the PrawnDO."""
+
+    def make(self, **settings: Any) -> TeensyModel:
+        return TeensyModel(self.trigger, self.trigger.low, **settings)
+
+    @property
+    def plays(self) -> bool:
+        return bool(self.model.state == "playing")
+
+    @property
+    def held(self) -> None:
+        """Not looked at: what plays is."""
+
+    def open(self, timing: float = REPLY_S, **config: Any) -> Teensy:  # type: ignore[override]
+        made = TeensyConfig.model_validate({"port": "emulated:sync", **config})
+        return Teensy(made, self.surroundings, timing)
+
+
+@contextmanager
+def teensy(faults: FaultSchedule | None = None, **settings: Any) -> Iterator[TeensyBoard]:
+    made = TeensyBoard(faults, **settings)
     with made.server:
         yield made
 

@@ -19,7 +19,7 @@ from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, ibeam, obis
 from drivers.registry import Surroundings
 from drivers.spads import spad512s, spb_usb
-from drivers.sync import prawndo, pulsestreamer
+from drivers.sync import prawndo, pulsestreamer, teensy
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
@@ -27,6 +27,7 @@ from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
+from tests.wire import syncs
 from tests.wire.etherdream import wired
 from tests.wire.lasers import bring_up, wire
 from tests.wire.spb_device import model
@@ -63,6 +64,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
             ibeam: at_ibeam,
             prawndo: Surroundings(sync.clock, None, 0, {"sync": ids}),
             pulsestreamer: Surroundings(clock, None, 0, {"sync": box.server.endpoint}),
+            teensy: stack.enter_context(syncs.teensy()).surroundings,
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
         }
         for module, surroundings in places.items():

@@ -61,7 +61,7 @@ void enter(uint64_t at) {
 void play() {
   if (state != PLAYING) return;
   if (!host_there()) return stop(ABORTED, "port");  // checked here, as the main program may hang
-  if (watchdog && now() - beat >= watchdog) return stop(ABORTED, "watchdog");
+  if (now() - beat >= watchdog) return stop(ABORTED, "watchdog");
   for (;;) {
     const Word &w = words[place];
     bool high = digitalReadFast(SCAN_PIN);
@@ -89,14 +89,22 @@ void play() {
   }
 }
 
+uint32_t checksum(uint32_t sum, const char *text) {  // CRC-32 of zlib, without its inversions at start and end
+  for (; *text; text++) {
+    sum ^= uint8_t(*text);
+    for (int bit = 0; bit < 8; bit++) sum = sum >> 1 ^ (sum & 1 ? 0xEDB88320 : 0);
+  }
+  return sum;
+}
+
 void reply(const char *format, ...) {
   char text[200];
   int n = snprintf(text, sizeof text, "%s", tag);
   va_list arguments;
   va_start(arguments, format);
-  n += vsnprintf(text + n, sizeof text - n - 1, format, arguments);
+  n += vsnprintf(text + n, sizeof text - n, format, arguments);
   va_end(arguments);
-  text[n++] = '\n';
+  n += snprintf(text + n, sizeof text - n, " *%08x\n", unsigned(~checksum(~0U, text)));
   noInterrupts();
   if (*format == 'o') beat = now();  // only what is answered ok is the host's heartbeat
   interrupts();
@@ -106,7 +114,7 @@ void reply(const char *format, ...) {
 }
 
 void reply_status() {
-  delayMicroseconds(1);  // the pins follow
+  delayMicroseconds(1);  // until the pins have followed
   noInterrupts();
   const char *name = state != PLAYING ? (state == STOPPED ? "stopped" : "aborted")
                                       : (words[place].ticks ? "running" : "waiting");
@@ -114,14 +122,6 @@ void reply_status() {
   const char *reason = why;
   interrupts();
   reply("ok state=%s sweeps=%u word=%u pins=%u marker=%u cuts=%u why=%s", name, done, at, pins, marker, dark, reason);
-}
-
-uint32_t checksum(uint32_t sum, const char *text) {  // CRC-32 of zlib, without its inversions at start and end
-  for (; *text; text++) {
-    sum ^= uint8_t(*text);
-    for (int bit = 0; bit < 8; bit++) sum = sum >> 1 ^ (sum & 1 ? 0xEDB88320 : 0);
-  }
-  return sum;
 }
 
 bool decimal(const char *text, uint32_t least, uint32_t most, uint32_t &value) {
@@ -178,6 +178,8 @@ void obey(char *text) {
   auto is = [&](const char *name) { return n && parts[0] == text && strcmp(text, name) == 0; };
   bool loads = is("new") || is("add") || is("end");
   EXPECT(state != PLAYING || !(loads || is("run")), "busy: abort first");
+  EXPECT(host_there() || !(loads || is("run")), "port: DTR is low");
+  EXPECT(load != LOADED || !is("end"), "complete already");
   Load was = load;
   if (loads) load = EMPTY;  // until the line has turned out right
   if (is("new")) {
@@ -203,9 +205,8 @@ void obey(char *text) {
     load = LOADED;
     reply("ok");
   } else if (is("run")) {
-    EXPECT(n == 2 && decimal(parts[1], 0, MAX_WATCHDOG_MS, a), "usage: run WATCHDOG");
+    EXPECT(n == 2 && decimal(parts[1], 1, MAX_WATCHDOG_MS, a), "usage: run WATCHDOG");
     EXPECT(load == LOADED, "no program: new, add, end");
-    EXPECT(host_there(), "port: DTR is low");
     run(a);
     reply_status();
   } else if (is("id")) {
@@ -232,6 +233,12 @@ void take_line() {
 }
 
 void loop() {
+  if (!host_there()) {
+    load = EMPTY;
+    noInterrupts();
+    play();  // which ends the program, even if the port is open again at once
+    interrupts();
+  }
   while (Serial.available() > 0) {
     int c = Serial.read();
     if (c == '\n') line[length] = 0, take_line();

@@ -68,7 +68,7 @@ class TeensyModel:
         self.hold_s = 0.0
         self.sweeps = self.cuts = 0
         self.watchdog_s = 0.0
-        """Longest silence of the host while a program plays; 0: any."""
+        """Longest silence of the host while a program plays."""
         self._crc = 0
         self._line = bytearray()
         self._too_long = False
@@ -125,7 +125,7 @@ class TeensyModel:
     def close_port(self, at_s: float) -> None:
         """Let DTR fall, as when the host's process ends; the same happens if USB is suspended."""
         self.advance(at_s)
-        self.dtr = False
+        self.dtr, self.load = False, "empty"
         if self.state == "playing":
             self._stop("aborted", "port", self._now_s)
 
@@ -145,7 +145,7 @@ class TeensyModel:
 
     def advance(self, until_s: float) -> None:
         """Play the program up to `until_s`."""
-        silent_s = self._beat_s + self.watchdog_s if self.watchdog_s else inf
+        silent_s = self._beat_s + self.watchdog_s
         self._play(min(until_s, silent_s))
         if self.state == "playing" and silent_s <= until_s:
             self._stop("aborted", "watchdog", silent_s)
@@ -249,14 +249,20 @@ class TeensyModel:
             return b""
         if reply.startswith("ok"):
             self._beat_s = self._now_s
-        return f"{tag}{reply}\n".encode("latin-1")
+        said = f"{tag}{reply}".encode("latin-1")
+        return said + b" *%08x\n" % zlib.crc32(said)
 
     def _obey(self, text: str) -> str:
         name, *arguments = [part for part in text.split(" ") if part] or [""]
         if text.startswith(" "):
             return "error unknown command"
-        if self.state == "playing" and name in ("new", "add", "end", "run"):
-            return "error busy: abort first"
+        if name in ("new", "add", "end", "run"):
+            if self.state == "playing":
+                return "error busy: abort first"
+            if not self.dtr:
+                return "error port: DTR is low"
+            if self.load == "loaded" and name == "end":
+                return "error complete already"
         match name:
             case "new" | "add" | "end":
                 return self._load(name, arguments, text)
@@ -312,12 +318,10 @@ class TeensyModel:
 
     def _run(self, arguments: list[str]) -> str:
         watchdog_ms = _decimal(arguments[0], MAX_WATCHDOG_MS) if len(arguments) == 1 else None
-        if watchdog_ms is None:
+        if not watchdog_ms:
             return "error usage: run WATCHDOG"
         if self.load != "loaded":
             return NO_PROGRAM
-        if not self.dtr:
-            return "error port: DTR is low"
         self.state, self.why, self.watchdog_s = "playing", "none", watchdog_ms / 1000
         self._place = self._rounds = self.sweeps = self.cuts = 0
         self._gate_low = False

@@ -14,6 +14,7 @@ from functools import partial
 from tests.campaigns.devices import blanking, lasers, scanners, spad512s, spb_usb, syncs
 from tests.campaigns.devices.prawndo import PRAWNDO
 from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
+from tests.campaigns.devices.teensy import TEENSY
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
@@ -21,6 +22,7 @@ SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
     "ibeam": partial(lasers.sequence, lasers.IBEAM),
     "prawndo": partial(syncs.sequence, PRAWNDO),
+    "teensy": partial(syncs.sequence, TEENSY),
     "pulsestreamer": partial(syncs.sequence, PULSESTREAMER),
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
@@ -34,6 +36,7 @@ WATCHED = {
     "cobolt": "longest verb, s",
     "ibeam": "longest verb, s",
     "prawndo": "longest verb, s",
+    "teensy": "longest verb, s",
     "pulsestreamer": "longest verb, s",
     "blanking": "largest error of a synchronised map, columns",
 }

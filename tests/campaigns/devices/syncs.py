@@ -1,8 +1,8 @@
 """Random faults on the wire of a sync source.
 
-What a verb claims is held against the outputs themselves. After `abort` or `gate_low` has returned all are low and stay
-low, whatever scan markers come. After `run` has returned the program comes out as it was written, and as often. A
-status of low outputs is one. A verb in a state that does not allow it is rightly refused.
+What a verb claims is held against the outputs themselves. After `abort` has returned all are low and stay low, whatever
+scan markers come; after `gate_low` the gate is. After `run` has returned the program comes out as it was written, and
+as often. A status of low outputs is one. A verb in a state that does not allow it is rightly refused.
 """
 
 import random
@@ -116,7 +116,7 @@ class Sequence:
         asked = Asked(words, self._random.choice((1, 10, 1000)), self._subject.waits and self._random.random() < 0.5)
         pulses = [Pulse(outputs, 1e-9 * ns) for outputs, ns in words]
         device.program([Pulse(0, None), *pulses] if asked.waits else pulses, asked.repeats)
-        self._asked = asked
+        self._asked, self._begun_s = asked, None
         if (held := self._bench.held) is not None:
             assert held == list(words) * asked.repeats, f"the board holds {held[:4]}... ({len(held)})"
 
@@ -124,6 +124,7 @@ class Sequence:
         if self._asked is None:
             self._program(device)
         self._begun_s, begun_s = None, self._bench.now_s
+        self._bench.pass_time(1e-6)
         if self._subject.interrupts and self._random.random() < 0.5:
             self._interrupted_run(device)
             return
@@ -134,8 +135,10 @@ class Sequence:
     def _interrupted_run(self, device: SyncSource) -> None:
         """Let another thread take outputs low meanwhile: if it says that they are, they are."""
         lowered: list[bool] = []
+        begun = threading.Event()
 
         def lower() -> None:
+            begun.wait()
             self._bench.pass_time(self._random.uniform(0, 0.004))
             with suppress(DeviceError):
                 device.abort()
@@ -143,27 +146,30 @@ class Sequence:
 
         thread = threading.Thread(target=lower)
         thread.start()
-        begun_s = self._bench.now_s
         try:
+            begun.set()
             device.run()
         finally:
             came_first = not lowered
             thread.join()
         if came_first and lowered:
-            self._require_low()
-        elif not lowered:
-            self._begun_s = begun_s
+            self._require_low()  # else nobody knows: an abort that failed may have been heard
 
     def _lower(self, device: SyncSource) -> None:
         self._begun_s = None
-        self._random.choice((device.abort, device.gate_low))()
-        self._require_low()
+        if self._random.random() < 0.5:
+            device.abort()
+            self._require_low()
+        else:
+            device.gate_low()
+            self._require_low(OUT_GATE)
 
     def _status(self, device: SyncSource) -> None:
         bench = self._bench
-        played = bench.plays
+        played, since_s = bench.plays, bench.now_s
         status = device.status
-        assert status.outputs in (None, bench.pins), f"{status}, outputs are {bench.pins}"
+        shown = {bench.pins, *(outputs for _, outputs in bench.changes(since_s))}
+        assert status.outputs is None or status.outputs in shown, f"{status}, outputs are {shown}"
         plays = bench.plays  # a program may end while it is asked for
         assert (status.state == "running") in (played, plays), f"{status}, it plays: {played}, then {plays}"
         self._require_program(device)
@@ -197,12 +203,12 @@ class Sequence:
             wrong = None if self._asked.waits or late or getattr(device, "port_lost", False) else wrong
         assert wrong is None, wrong
 
-    def _require_low(self) -> None:
-        assert not self._bench.pins, f"outputs are {self._bench.pins}"
+    def _require_low(self, which: int = ~0) -> None:
+        assert not self._bench.pins & which, f"outputs are {self._bench.pins}"
         since_s = self._bench.now_s
         self._bench.pass_time(LOOK_S)
         changes = self._bench.changes(since_s)
-        assert not any(outputs for _, outputs in changes), f"outputs went up again: {changes[:3]}"
+        assert not any(outputs & which for _, outputs in changes), f"outputs went up again: {changes[:3]}"
 
 
 def sequence(subject: Subject, seed: int) -> Ending:

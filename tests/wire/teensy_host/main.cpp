@@ -34,8 +34,7 @@ int main() {
     pass(e.when);
     if (e.what == "dtr") Serial.dtr_level = e.value == "1";
     if (e.what == "suspend") USB1_PORTSC1 = e.value == "1" ? USB_PORTSC1_SUSP : 0;
-    if (e.what != "send") continue;
-    for (size_t i = 0; i + 1 < e.value.size(); i += 2) received += char(std::stoi(e.value.substr(i, 2), nullptr, 16));
+    for (size_t i = 0; e.what == "send" && i + 1 < e.value.size(); i += 2) received += char(std::stoi(e.value.substr(i, 2), nullptr, 16));
     loop();
   }
 }
