@@ -34,14 +34,16 @@ class TtlConfig(KindConfig):
     """Power, in watts, that is set at the laser: that of its light while the gate is high."""
     max_power: Annotated[Watts, Field(gt=0)]
     """Most power, in watts, that this rig may ever send out."""
-    port: Annotated[str | None, Field(pattern=f"^{EMULATED_PREFIX}.")] = None
+    port: str | None = None
     """ "emulated:NAME" for a laser of an emulating world. None: a real laser, which has no port."""
 
     @model_validator(mode="after")
-    def _check_power(self) -> Self:
+    def _check(self) -> Self:
         if self.power > self.max_power:
             power, most = (format_quantity(value, "power") for value in (self.power, self.max_power))
             raise ValueError(f"power {power} is above max_power {most}; set the laser to less, and write that here")
+        if self.port is not None and (not self.port.startswith(EMULATED_PREFIX) or self.port == EMULATED_PREFIX):
+            raise ValueError(f"port is {self.port!r}, a laser that is switched by hand has none; leave it out")
         return self
 
 

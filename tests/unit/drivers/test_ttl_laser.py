@@ -37,7 +37,7 @@ def test_a_config_needs_the_power_that_is_set_and_a_limit_above_it() -> None:
 
 def test_it_has_no_port_but_that_of_an_emulating_world() -> None:
     for port in ("/dev/ttyUSB0", "COM5", "emulated:", ""):
-        with pytest.raises(ValidationError):
+        with pytest.raises(ValidationError, match="switched by hand has none; leave it out"):
             TtlConfig.model_validate(HAND | {"port": port})
     config = TtlConfig.model_validate(HAND | {"port": "emulated:laser"})
     with pytest.raises(DeviceNotFound, match="this rig emulates no devices"):
