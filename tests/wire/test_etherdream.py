@@ -307,10 +307,10 @@ def _late(wire: TcpWire) -> None:
 
 def _other_client(wire: TcpWire, n: int = 5) -> None:
     with wire.lock:
-        wire.model._ring = np.concatenate([wire.model._ring, wire.model._ring[-n:]])  # type: ignore[attr-defined]
+        wire.model._ring = np.concatenate([wire.model._ring, wire.model._ring[-n:]])
 
 
-FAULTS: dict[str, tuple[Callable[[Any], None], str]] = {
+FAULTS: dict[str, tuple[Callable[[Any], object], str]] = {
     "the host is late": (_late, "ran dry"),
     "another client sends points": (_other_client, "lost or repeated"),
     "another client stops": (lambda wire: wire.model._stop(0, wire.now_s), "stopped from elsewhere"),
@@ -341,7 +341,7 @@ def test_what_ends_a_run_or_the_hold_is_a_fault_and_the_next_run_begins_at_the_c
         began_s = wire.now_s
         play(device, 1)
         assert device.status.fault is None
-        assert wire.model.history.command(np.array([began_s]))[0] == CENTRE  # type: ignore[attr-defined]
+        assert wire.model.history.command(np.array([began_s]))[0] == CENTRE
 
 
 def test_a_single_point_too_many_shortly_before_the_end_is_a_fault() -> None:
@@ -382,8 +382,8 @@ def test_a_lost_connection_is_told_and_a_board_that_hangs_ends_the_run_in_time()
             assert wire.now_s - began_s < 2
             assert device.state is DeviceState.CLOSED
             wire._clock.sleep(0.5)
-            assert not wire.model.moving(wire.now_s)  # type: ignore[attr-defined]
-            assert wire.model.history.command(np.array([wire.now_s]))[0] == CENTRE  # type: ignore[attr-defined]
+            assert not wire.model.moving(wire.now_s)
+            assert wire.model.history.command(np.array([wire.now_s]))[0] == CENTRE
 
 
 def test_a_board_in_use_or_stopped_is_refused_or_cleared() -> None:

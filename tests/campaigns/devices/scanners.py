@@ -19,7 +19,7 @@ from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from sim_backend.wire.firmware import helios
 from sim_backend.wire.firmware.etherdream import EtherDreamModel
-from sim_backend.wire.firmware.helios import DacHistory, DacModel
+from sim_backend.wire.firmware.helios import DacHistory
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire import lasercube
 from tests.wire.etherdream import open_etherdream, wired
@@ -40,7 +40,7 @@ class Subject:
     """
 
     kind: str
-    model: Callable[[], DacModel | EtherDreamModel]
+    model: Callable[[], Any]
     config: dict[str, object]
     scan: int
     line: int
