@@ -229,7 +229,7 @@ class PulseStreamer(SyncBoard):
             asked_s = now_s(self._clock)
             plays = self._flag("isStreaming")
             if not self._has_ended(run, asked_s, plays):
-                return SyncStatus("running" if plays or not run.waits else "waiting", None)
+                return SyncStatus("running" if plays else "waiting" if run.waits else "aborted", None)
         with self._lock:  # another thread may just be taking the outputs low
             plays = self._flag("isStreaming")
             if plays or self._run is not None:
