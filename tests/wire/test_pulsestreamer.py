@@ -100,7 +100,7 @@ def test_opening_first_takes_all_low_whatever_the_box_was_doing(keeps_sequence: 
 
 
 def test_each_verb_says_what_it_has_to_and_no_more() -> None:
-    lowering = [("constant", LOW), ("setTrigger", 1, 1), "stream 1 times", ("constant", LOW)]
+    lowering = [("constant", LOW), ("setTrigger", 1, 1), ("constant", LOW), "stream 1 times"]
     with pulse_box() as box, box.open() as device:
         calls = heard(box)
         for pulses, repeats, expected in (
