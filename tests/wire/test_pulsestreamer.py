@@ -193,7 +193,12 @@ def test_ctrl_c_anywhere_on_the_way_to_light_leaves_it_dark_whatever_the_box_hea
 def test_an_abort_of_another_thread_meanwhile_is_the_last_word(step: str) -> None:
     with pulse_box() as box, box.open() as device:
         device.program((GATE,), 1000)
-        lowered, threads = threading.Event(), [threading.Thread(target=device.abort)]
+
+        def abort() -> None:
+            with suppress(DeviceFault):  # the next run may be on its way when it reads the outputs back
+                device.abort()
+
+        lowered, threads = threading.Event(), [threading.Thread(target=abort)]
 
         def before(method: str) -> None:
             if method == step and threads:
