@@ -229,7 +229,7 @@ class PulseStreamer(SyncBoard):
             asked_s = now_s(self._clock)
             plays = self._flag("isStreaming")
             if not self._has_ended(run, asked_s, plays):
-                return SyncStatus("running" if plays or not run.waits else "waiting", None)
+                return SyncStatus("running" if plays else "waiting" if run.waits else "aborted", None)
         with self._lock:  # another thread may just be taking the outputs low
             plays = self._flag("isStreaming")
             if plays or self._run is not None:
@@ -254,10 +254,10 @@ class PulseStreamer(SyncBoard):
                 self._run, self._ended = None, ended
             self._safe = False
             self._rpc.call("setTrigger", SOFTWARE, MANUAL)
-            # In place of the program, which some firmware may keep: whatever call of an interrupted or failed `run` the
-            # box takes up only after this, it has nothing else to play.
-            self._rpc.call("stream", _DARK, 1, LOW)
             self._rpc.call("constant", LOW)  # again: until now a trigger may have started what was armed
+            # In place of the program, which some firmware may keep: whatever call of an interrupted or failed `run` the
+            # box takes up only after this, it has nothing else to play. Last, as it would freeze a high gate.
+            self._rpc.call("stream", _DARK, 1, LOW)
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:

@@ -36,8 +36,9 @@ _CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class GateSequence:
-    """Steps that the box plays after each wait. steps: `STEP` (n,). sweeps: number of times. waits: whether it waits
-    for the scan marker before each; rest: levels of the channels meanwhile.
+    """Steps that the box plays after each wait. steps: `STEP` (n,). sweeps: number of times.
+
+    waits: whether it waits for the scan marker before each; rest: levels of the channels meanwhile.
     """
 
     steps: NDArray[np.void]
