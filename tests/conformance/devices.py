@@ -10,17 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.clock import SystemClock, VirtualClock
-from drivers.guard import Guard, GuardLimits
+from drivers.clock import VirtualClock
+from drivers.guard import Guard
 from drivers.interfaces import SyncSource
-from drivers.lasers.ibeam import IbeamConfig
 from drivers.lasers.obis import ObisConfig
-from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.lasers.ttl import TtlConfig, TtlLaser
 from drivers.registry import Surroundings, lookup
 from drivers.sync.prawndo import PrawnDoConfig
-from drivers.sync.pulsestreamer import PulseStreamerConfig
-from drivers.sync.teensy import TeensyConfig
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import DacModel, HeliosModel
@@ -61,13 +57,11 @@ def ibeam(folder: Path, **settings: Any) -> Iterator[LaserCase]:
 
 
 @contextmanager
-def guarded(folder: Path, model: Any, config: type[SerialLaserConfig]) -> Iterator[LaserCase]:
-    made, clock = model(), VirtualClock()
-    with (
-        SerialServer(made, clock=clock) as server,
-        Guard(laser=config.model_validate(USUAL), ports={"laser": server.endpoint}) as guard,
-    ):
-        yield LaserCase(guard.laser, clock, lambda: made.emitting)
+def guarded_obis(folder: Path) -> Iterator[LaserCase]:
+    model = ObisModel(cdrh_delay_s=0.2)
+    clock, config = VirtualClock(), ObisConfig.model_validate(USUAL)
+    with SerialServer(model, clock=clock) as server, Guard(laser=config, ports={"laser": server.endpoint}) as guard:
+        yield LaserCase(guard.laser, clock, lambda: model.emitting)
 
 
 @contextmanager
@@ -132,26 +126,9 @@ def emulated_teensy(folder: Path) -> Iterator[SyncCase]:
 
 
 @contextmanager
-def guarded_teensy(folder: Path) -> Iterator[SyncCase]:
-    config = TeensyConfig(port="emulated:sync")
-    with teensy(terminal=True) as wired, Guard(sync=config, ports={"sync": wired.server.endpoint}) as guard:
-        yield _on_board(wired, guard.sync)
-
-
-@contextmanager
 def emulated_pulse_streamer(folder: Path) -> Iterator[SyncCase]:
     with pulse_box() as box, box.open() as device:
         yield _on_board(box, device)
-
-
-@contextmanager
-def guarded_pulse_streamer(folder: Path) -> Iterator[SyncCase]:
-    """In the host's time, in which the driver counts sweeps."""
-    config = PulseStreamerConfig(port="emulated:sync")
-    box = PulseBox(clock=SystemClock())
-    limits = GuardLimits(first_frame_s=60.0)  # no SPAD gives frames
-    with box.server, Guard(sync=config, ports={"sync": box.server.endpoint}, limits=limits) as guard:
-        yield _on_board(box, guard.sync, 0.01, step_s=0.15)
 
 
 @contextmanager
@@ -172,12 +149,11 @@ LASERS: dict[str, Factory] = {
     "cobolt 06-01": partial(cobolt, family="06-01"),
     "obis without handshake, cold": partial(obis, handshake=False, warm_up_s=3.0),
     "obis behind a remote": partial(obis, channel=2),
-    "obis, guarded": partial(guarded, model=partial(ObisModel, cdrh_delay_s=0.2), config=ObisConfig),
+    "obis, guarded": guarded_obis,
     "ibeam": ibeam,
     "ibeam, talkative, 5 channels": partial(
         ibeam, talk="gabby", powers_w=dict.fromkeys(range(1, 6), 0.01), enabled={1, 3, 4}, disabled_shine=True
     ),
-    "ibeam, guarded": partial(guarded, model=IbeamModel, config=IbeamConfig),
     "ttl": ttl,
     "ttl, guarded": guarded_ttl,
 }
@@ -193,7 +169,5 @@ SYNCS: dict[str, Factory] = {
     "prawndo": emulated_prawndo,
     "prawndo, guarded": guarded_prawndo,
     "teensy": emulated_teensy,
-    "teensy, guarded": guarded_teensy,
     "pulsestreamer": emulated_pulse_streamer,
-    "pulsestreamer, guarded": guarded_pulse_streamer,
 }
