@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
-from tests.campaigns.devices import blanking, lasers, prawndo, scanners, spad512s, spb_usb
+from tests.campaigns.devices import blanking, lasers, ni_cards, prawndo, scanners, spad512s, spb_usb
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
@@ -20,6 +20,7 @@ SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "prawndo": prawndo.sequence,
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
+    "nidaq": ni_cards.sequence,
     "spb-usb": spb_usb.sequence,
     "spad512s": spad512s.sequence,
     "blanking": blanking.sequence,

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_LINE, MARKER_SCAN, BeamScanner, ScanWaveform
 from sim_backend.wire.firmware import helios
-from sim_backend.wire.firmware.helios import DacHistory, DacModel
+from sim_backend.wire.firmware.helios import DacHistory
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire import lasercube
 from tests.wire.faults import Fault, FaultSchedule, FaultyUsb
@@ -35,7 +36,7 @@ class Subject:
     """
 
     kind: str
-    model: Callable[[], DacModel]
+    model: Callable[[], Any]
     config: dict[str, object]
     scan: int
     line: int
@@ -76,35 +77,46 @@ def sequence(subject: Subject, seed: int) -> Ending:
     before = threading.excepthook
     threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
     try:
-        ended = ending(lambda: _judged(subject, rng, plugged, model.history), plugged.now_s, DEADLINE_S)
+
+        def act() -> str:
+            with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
+                return judged(subject, rng, device, wave(device), plugged.now_s, model.history)
+
+        ended = ending(act, plugged.now_s, DEADLINE_S)
     finally:
         threading.excepthook = before
     struck = [fault.value for fault in schedule.struck]
     return ended._replace(wrong=foreign[0] if foreign else ended.wrong, struck=struck)
 
 
-def _judged(subject: Subject, rng: random.Random, plugged: Plugged, history: DacHistory) -> str:
-    with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
-        for _ in range(rng.randrange(1, 3)):
-            repeats = rng.randrange(3, 8)
-            waveform = wave(device)
-            clock = device.load(waveform, repeats)
-            began_s = plugged.now_s()
-            device.start()
-            stopped = rng.random() < 0.3
-            if stopped:
-                time.sleep(rng.random() * 0.003)
-                device.stop()
-            else:
-                finish(device)
-            fault = device.status.fault
-            if fault is not None:
-                assert "\n" not in fault, "a fault of several lines"
-                return "fault"
-            put_out = Played(subject, history, float(clock), began_s, plugged.now_s())
-            put_out.require(waveform, repeats, stopped=stopped)
-            if rng.random() < 0.5:
-                device.park()
+def judged(
+    subject: Subject,
+    rng: random.Random,
+    device: BeamScanner,
+    waveform: ScanWaveform,
+    now_s: Callable[[], float],
+    history: DacHistory,
+) -> str:
+    """Play the waveform once or twice, to the end or to a stop; how that ended. AssertionError if it ended wrong."""
+    for _ in range(rng.randrange(1, 3)):
+        repeats = rng.randrange(3, 8)
+        clock = device.load(waveform, repeats)
+        began_s = now_s()
+        device.start()
+        stopped = rng.random() < 0.3
+        if stopped:
+            time.sleep(rng.random() * 0.003)
+            device.stop()
+        else:
+            finish(device)
+        fault = device.status.fault
+        if fault is not None:
+            assert "\n" not in fault, "a fault of several lines"
+            return "fault"
+        put_out = Played(subject, history, float(clock), began_s, now_s())
+        put_out.require(waveform, repeats, stopped=stopped)
+        if rng.random() < 0.5:
+            device.park()
     return "complete"
 
 
