@@ -17,8 +17,8 @@ What drivers trip over:
 
 Public sources do not tell the following, and the model chose. A finite task is done half a period after its last
 sample. A stop drops samples that are not regenerated. A write to a task that waits for its trigger replaces samples
-that the card's memory already holds. A counter's first pulse begins at that edge of its clock before which
-`initial_delay` edges came. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand
+that the card's memory already holds. A counter's first pulse begins with the edge number `initial_delay` of its
+clock after the start. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand
 write with automatic start releases the output afterwards. Analogue outputs with and without a clock exclude each other,
 as on a PXI-6723. Lines that are taken are -200587, all else that is taken -50103. Full scale is exactly 10 V in 32767
 steps.

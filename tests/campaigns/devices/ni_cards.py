@@ -32,6 +32,8 @@ from tests.wire.scanners import GALVO
 FAULTS = (Fault.LATE, Fault.LOST, Fault.STALL, Fault.UNPLUG, Fault.HANG, Fault.CORRUPTED, Fault.TRUNCATED)
 """Corrupted: refused. Truncated: done, but told to have failed."""
 CODES = (-50103, -200587, -200452, -88709, -201003, -50405, -200474, -200290, -12345)
+GONE = (-88709, -201003, -50405)
+"""Codes after which the driver takes the card for lost, with nothing left to be made safe."""
 NIDAQ = scanners.Subject("nidaq", NidaqModel, {"buffer": "100 ms"}, BLUE, GREEN, INTENSITY)
 DEADLINE_S = 60.0
 
@@ -86,7 +88,7 @@ class FaultyChannel:
         self._server._server = self
         self._methods = self._server._messages.DESCRIPTOR.services_by_name["NiDAQmx"].methods_by_name
         self._lock = threading.Lock()
-        self.gone = self.hung = False
+        self.gone = self.hung = self.gone_told = False
         self._stalled_until_s = 0.0
 
     def unary_unary(self, path: str, *_: Any, **__: Any) -> Any:
@@ -138,6 +140,7 @@ class FaultyChannel:
 
     def _refused(self) -> CallFailed:
         code = self._rng.choice(CODES)
+        self.gone_told |= code in GONE
         return CallFailed(grpc.StatusCode.UNKNOWN, f"error {code}\nin detail", [_Key("ni-error", str(code))])
 
 
@@ -176,7 +179,7 @@ def sequence(seed: int) -> Ending:
     def act() -> str:
         with entry.create(config, surroundings) as device:
             end = scanners.judged(NIDAQ, rng, device, lit_wave(device), lambda: now_s(clock), model.history)
-        if not channel.gone:
+        if not (channel.gone or channel.gone_told):
             require_rest(model, now_s(clock))
         return end
 

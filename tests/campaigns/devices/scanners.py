@@ -21,7 +21,7 @@ from sim_backend.wire.firmware.helios import DacHistory
 from tests.campaigns.outcomes import Ending, ending
 from tests.wire import lasercube
 from tests.wire.faults import Fault, FaultSchedule, FaultyUsb
-from tests.wire.scanners import Plugged, finish, open_scanner, plug
+from tests.wire.scanners import finish, open_scanner, plug
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0

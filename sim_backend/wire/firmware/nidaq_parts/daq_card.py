@@ -234,7 +234,7 @@ class Card:
         assert task.edges is not None, "asked for by the caller"
         if task.kind == "co":
             delay, high, low = task.pulse
-            edges = Edges(task.edges.at(delay), task.edges.period_s)
+            edges = Edges(task.edges.at(max(0, delay - 1)), task.edges.period_s)
             data = np.repeat([1, 0], [high, low])
             self.outputs[task.outputs[0]].play(Span(edges, task.limit * (high + low), data))
             return

@@ -161,7 +161,7 @@ class Task:
             return np.inf
         if self.kind == "co":
             delay, high, low = self.pulse
-            return self.edges.at(delay + self.limit * (high + low))
+            return self.edges.at(max(0, delay - 1) + self.limit * (high + low))
         if not self.regenerates and self.written < self.limit:
             return self.edges.at(self.written - self.played)
         return self.edges.at(self.limit - self.played - 0.5)
