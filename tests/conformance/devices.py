@@ -24,6 +24,7 @@ from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
 from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import eventually, open_cobolt, open_obis, wire
+from tests.wire.ni_bench import ni_bench
 from tests.wire.scanners import opened
 from tests.wire.syncs import Board, board
 
@@ -81,6 +82,18 @@ def emulated_scanner(folder: Path, kind: str, make: Callable[[], DacModel]) -> I
         yield ScannerCase(device, lambda: model.moving(plugged.now_s()), let_pass)
 
 
+@contextmanager
+def nidaq(folder: Path, **config: Any) -> Iterator[ScannerCase]:
+    with ni_bench() as bench, bench.open(**config) as device:
+
+        def let_pass(seconds: float) -> None:
+            ends_s = bench.now_s() + seconds
+            eventually(lambda: not device.status.moving or bench.now_s() >= ends_s)
+            bench.clock.sleep(ends_s - bench.now_s())
+
+        yield ScannerCase(device, lambda: bench.model.moving(bench.now_s()), let_pass)
+
+
 def _on_board(board: Board, device: SyncSource) -> SyncCase:
     def trigger() -> None:
         board.trigger.pulse(board.now_s + 1e-6, 10e-6)
@@ -128,6 +141,7 @@ SCANNERS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="scanner"),
     "helios, emulated": partial(emulated_scanner, kind="helios", make=HeliosModel),
     "lasercube, emulated": partial(emulated_scanner, kind="lasercube", make=LaserCubeModel),
+    "nidaq, emulated": nidaq,
 }
 SYNCS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="sync"),

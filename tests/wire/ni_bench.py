@@ -63,5 +63,6 @@ def ni_bench(clock: Clock | None = None, **options: Any) -> Iterator[NiBench]:
 def marked(device: BeamScanner, points: int = 2500) -> ScanWaveform:
     """The cosine with a scan marker that is high nearly all the time, as in a scan."""
     wave = cosine(device, points)
-    wave.markers[:-100] |= MARKER_SCAN
+    wave.markers[: points // 3] |= MARKER_SCAN
+    wave.markers[points // 3 + 50 :] |= MARKER_SCAN
     return wave

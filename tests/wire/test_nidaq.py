@@ -157,7 +157,7 @@ def test_a_mirror_left_elsewhere_with_markers_high_comes_to_the_centre_and_they_
     [
         ({0x2996: False}, {}, "no analogue output with a sample clock"),
         ({0x2996: None}, {}, "no analogue output with a sample clock"),
-        ({0x299A: None}, {}, "no digital lines with a sample clock; set .*counter or null"),
+        ({0x299A: None}, {}, "no digital lines with a sample clock; make each marker a counter"),
         ({0x299B: [-5.0, 5.0]}, {}, "full_scale 10 V is beyond its -5 to 5 V; lower it"),
         ({0x2997: 833.0}, {"clock": "PFI0", "clock_rate": "2 kHz"}, "2000 Hz exceeds 833 Hz; divide the clock"),
     ],
@@ -292,8 +292,6 @@ def test_a_reset_by_another_program_ends_the_run(bench: NiBench) -> None:
             bench.model.reset(bench.now_s())
         with pytest.raises(DeviceDisconnected, match="-88709"):
             finish(device)
-        with pytest.raises(DeviceDisconnected):
-            device.stop()
         assert bench.levels() == [0, 0, 0]
 
 
@@ -315,6 +313,10 @@ def test_a_lost_server_is_said_by_every_verb_and_close_returns(
     assert not bench.model.moving(bench.now_s())
     assert bench.levels()[1] == moves, "as they were: the gate must not depend on this card alone"
     bench.server.plug()
+    if moves:
+        with pytest.raises(DeviceBusy, match=r"restart NI's gRPC server"):  # where its tasks live on
+            bench.open()
+        bench.model.reset(bench.now_s())
     with bench.open():
         assert bench.levels() == [0, 0, 0]
 

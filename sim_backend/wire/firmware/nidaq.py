@@ -256,7 +256,7 @@ class NidaqModel(Card):
         }
 
     def _of_task(self, task: Task, rpc: str, now_s: float) -> dict[int, Any]:
-        if rpc.startswith("GetWrite") and task.state == ni.RUNNING:
+        if rpc.startswith("GetWrite"):
             self._report(task)
         generated = task.generated(now_s)
         ahead = 0 if task.regenerates else max(0, task.written - generated - ni.FIFO.get(task.kind, 0))

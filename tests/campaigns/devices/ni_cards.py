@@ -214,5 +214,5 @@ def require_rest(model: NidaqModel, at_s: float) -> None:
     drive = float(model.history.command(at)[0])
     assert drive == 0, f"closed with the mirror at {drive:g}"
     # The package forgets a task whose creation fails half-way; such a one has nothing yet.
-    held = [task.name for task in model.tasks.values() if task.channels]
+    held = [task.name for task in model.tasks.values() if task.outputs]
     assert not held, f"closed with outputs in the tasks {', '.join(held)}"
