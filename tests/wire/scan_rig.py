@@ -35,6 +35,7 @@ from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 
 WIDTH, HEIGHT = 64, 16
 COLUMNS, EXPOSURES = 20, 12
+CARD_BUFFER_S = 0.5
 STILL_S = 1e-3
 """A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
 STEP_S = 5e-5
@@ -177,7 +178,9 @@ class ScanBench:
 
 
 @contextmanager
-def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -> Iterator[ScanBench]:
+def scan_bench(
+    applications: Applications, laser: str, silence: str = "1.5 s", scanner: str = "helios"
+) -> Iterator[ScanBench]:
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
         geometry = folder / "calibration.yaml"
@@ -188,6 +191,7 @@ def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -
                 "geometry": str(geometry),
                 "scene": "street-clear",
                 "laser": laser,
+                "scanner": scanner,
                 "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
             }
         )
@@ -197,7 +201,7 @@ def scan_bench(applications: Applications, laser: str, silence: str = "1.5 s") -
             else:
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
-            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence)))
+            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence, scanner)))
             bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
             try:
                 yield bench
@@ -219,7 +223,7 @@ def _end(bench: ScanBench) -> None:
     bench.applications.exit_code(bench.number, 5.0)
 
 
-def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
+def _config(laser: str, ports: dict[str, str], silence: str, scanner: str) -> dict[str, Any]:
     """The config of a rig with real ports; its world is outside of it."""
     content = emulated(**ports)
     del content["world"]
@@ -228,6 +232,10 @@ def _config(laser: str, ports: dict[str, str], silence: str) -> dict[str, Any]:
     content["spad"]["silence"] = silence
     # A machine that has much else to do may be late.
     content["scanner"] |= {"max_point_rate": "8 kHz", "frame": "250 ms"}
+    if scanner == "nidaq":
+        del content["scanner"]["frame"]
+        card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
+        content["scanner"] |= card
     content["laser"]["kind"] = laser
     content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": "20 mW"}
     content["estimate"]["threads"] = 1

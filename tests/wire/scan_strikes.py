@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from drivers.guard import GuardLimits
 from tests.wire.lasers import eventually
-from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
+from tests.wire.scan_rig import CARD_BUFFER_S, STEP_S, Applications, ScanBench, scan_bench
 
 GONE_S = 0.1
 """Light has to be gone after this, at the 99.9th percentile..."""
@@ -38,7 +38,7 @@ class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
     living, says what happened and ends with code 3. silence: of the SPAD that the guard lets pass; long, since
     an emulated one may itself be late. labours: threads fight the scan's for the interpreter. light_s, emission_s:
-    until they are gone, at most."""
+    until they are gone, at most. scanner: its kind."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
@@ -49,6 +49,7 @@ class ScanStrike:
     labours: bool = False
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
+    scanner: str = "helios"
 
 
 def _signal(number: int) -> Callable[[ScanBench], None]:
@@ -84,6 +85,17 @@ def _unplug_gate(bench: ScanBench) -> None:
         bench.world.sync.power_cycle(time.monotonic())
 
 
+def _reset_card(bench: ScanBench) -> None:
+    with bench.world.scanner_plug.lock:
+        bench.world.scanner.reset(time.monotonic())
+
+
+def _delay_card(bench: ScanBench) -> None:
+    """Its points run dry, and markers keep their last level."""
+    with bench.world.scanner_plug.lock:
+        time.sleep(2 * CARD_BUFFER_S)
+
+
 SCAN_STRIKES = {
     "application killed": ScanStrike(_signal(signal.SIGKILL), at_once=True),
     "application stopped": ScanStrike(_signal(signal.SIGSTOP)),
@@ -100,6 +112,12 @@ SCAN_STRIKES = {
     "laser unplugged": ScanStrike(lambda bench: bench.world.laser_wire.unplug(), own_end=True, laser_answers=False),
     "interlock opened": ScanStrike(_open_interlock, own_end=True),
     "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
+    # An NI card's scan marker stays as it was.
+    "killed, ni card": ScanStrike(_signal(signal.SIGKILL), scanner="nidaq"),
+    "ni card's server gone": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="nidaq"),
+    "ni card's server hangs": ScanStrike(lambda bench: bench.world.scanner_plug.hang(), own_end=True, scanner="nidaq"),
+    "ni card reset": ScanStrike(_reset_card, own_end=True, scanner="nidaq"),
+    "ni card runs dry": ScanStrike(_delay_card, own_end=True, scanner="nidaq"),
 }
 
 
@@ -129,7 +147,7 @@ def strike_scan(
     waited for.
     """
     made = SCAN_STRIKES[name]
-    with scan_bench(applications, laser, made.silence) as bench:
+    with scan_bench(applications, laser, made.silence, made.scanner) as bench:
         bench.start(maps=MAPS if measured else LONG_MAPS, record=made.record, labours=made.labours)
         opening_s = OPENING_S[laser] if made.at_once else 0.0
         into_s = share * (opening_s + LONG_S)

@@ -378,7 +378,7 @@ def test_ctrl_c_at_any_time_leaves_the_markers_low() -> None:
     with ni_bench(SystemClock()) as bench:
         for delay_s in np.linspace(0.001, 0.25, 12):
             timer = threading.Timer(delay_s, signal.raise_signal, (signal.SIGINT,))
-            with suppress(KeyboardInterrupt), bench.open() as device:
+            with suppress(KeyboardInterrupt), bench.open(buffer="2 s") as device:
                 device.load(marked(device, 700), 10_000)
                 timer.start()
                 device.start()

@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -27,6 +28,7 @@ from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.lasers import bring_up, wire
+from tests.wire.ni_bench import ni_bench
 from tests.wire.spb_device import model
 from tests.wire.syncs import board
 
@@ -61,6 +63,9 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
             monkeypatch.setattr(module, "alone", lambda surroundings=surroundings: surroundings)
         monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
         monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
+        card = stack.enter_context(ni_bench(clock))
+        monkeypatch.setattr("drivers.scanners.nidaq.SystemClock", lambda: clock)
+        monkeypatch.setenv("CARD", f"grpc={card.server.address}/Dev1")
         monkeypatch.setattr(time, "sleep", clock.sleep)
         yield {"laser": laser, "sync": sync.model, "scanner": helios}
 
@@ -70,6 +75,7 @@ def test_the_cells_of_the_page_run_as_they_are_written(
     cell: str, lab: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     addresses = {"/dev/ttyUSB0": "emulated:laser", "/dev/ttyACM0": "emulated:sync", "127.0.0.1:9999": "emulated:spad"}
+    addresses["Dev1"] = os.environ["CARD"]
     for real, emulated in addresses.items():
         cell = cell.replace(real, emulated)
     exec(compile(cell, str(PAGE), "exec"), {})
