@@ -90,7 +90,7 @@ class NidaqModel(Card):
             0x193B: self.name,
             **{0x1272: 26, 0x1923: 0, 0x2F22: 0},  # the driver's version
         }
-        """Of the device and its driver, by NI's numbers. Without some of them it is another card."""
+        """Properties of the device and its driver, by NI's numbers. Without some of them it is another card."""
         self.measures = True
         """Whether its outputs can be measured inside the card."""
         self.calls: list[str] = []

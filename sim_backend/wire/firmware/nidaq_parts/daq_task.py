@@ -86,7 +86,7 @@ class Task:
     kind: str = ""
     """ao, do, co or ai, as soon as there is a channel."""
     outputs: list[str] = field(default_factory=list)
-    """What its channel drives, such as `ao0`, or port0/line0 to line2."""
+    """Outputs that its channel drives, such as `ao0`, or port0/line0 to line2."""
     limits_v: tuple[float, float] = (0.0, 0.0)
     """Limits of an analogue output, as the client gave them."""
     clocked: bool = False
