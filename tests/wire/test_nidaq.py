@@ -1,8 +1,6 @@
 """The NI card's driver: its config, and what it does to an emulated card. Facts: docs/reference/devices/nidaq.md."""
 
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -15,7 +13,6 @@ import pytest
 from pydantic import ValidationError
 
 from drivers import errors
-from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import lookup
@@ -367,19 +364,3 @@ def test_an_interrupt_at_any_line_leaves_the_markers_low_and_no_task(bench: NiBe
         assert bench.drive()[0] == 0, at
         assert not any(task.outputs for task in bench.model.tasks.values()), at
     assert at > 300
-
-
-def test_ctrl_c_at_any_time_leaves_the_markers_low() -> None:
-    """Real signals: an interrupt must not get into gRPC, whose locks it could leave closed."""
-    with ni_bench(SystemClock()) as bench:
-        for delay_s in np.linspace(0.001, 0.25, 12):
-            timer = threading.Timer(delay_s, signal.raise_signal, (signal.SIGINT,))
-            with suppress(KeyboardInterrupt), bench.open(buffer="2 s") as device:
-                device.load(marked(device, 700), 10_000)
-                timer.start()
-                device.start()
-                while True:
-                    time.sleep(0.01)
-                    assert device.status.moving
-            assert bench.levels() == [0, 0, 0]
-            assert bench.drive()[0] == 0
