@@ -1,4 +1,4 @@
-"""Scanner kind `nidaq`: a galvo at an analogue output of an NI card, through NI-DAQmx (docs/reference/hardware.md).
+"""Scanner kind `nidaq`: a galvo at an analogue output of an NI card, through NI-DAQmx.
 
     outputs   aoN: mirror, drive -1 to 1 as -full_scale to full_scale. port0/line0: line marker. line1: scan marker.
               line2: backward. All change with the same sample clock
@@ -10,28 +10,23 @@ has generated. If the buffer runs dry, the card stops with an error, never with 
 
 After its points a run goes on with copies of the last one, markers low, until the card has generated the last point;
 then the tasks are stopped in the middle of the copies. A stopped output keeps its last level, and so does a cleared one
-and one whose buffer ran dry. The same is true of marker lines, so every way out of a run writes them low. It cannot if
-the host dies, or the connection to the server: then the markers stay as they are, and the laser's gate must not depend
-on this card alone.
+and one whose buffer ran dry. So every way out of a run writes the marker lines low. It cannot if the host dies, or the
+connection to the server: then the markers stay as they are, and the laser's gate must not depend on this card alone.
 
 `start` first turns the mirror to the first point, by the card's own clock. Only then is the waveform armed, with the
 clock, triggers and exports of the config. So its point 0 is the first sample clock after the start trigger.
 
 An output can be written, not read. Most cards with analogue inputs measure it on an internal channel, though. There,
 opening brings a mirror that stands elsewhere to the centre along a ramp, and after a failed run it stays where it is.
-Other cards jump to the centre in both cases.
-
-Sources: `ni/nidaqmx-python` cbba502 and `ni/grpc-device` c1ddf51; NI-DAQmx Help, "Key Concepts" and "Device
-Considerations"; X Series and USB-621x user manuals. No code was taken.
+Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
 """
 
 import math
-import re
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from fractions import Fraction
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Self
+from typing import Annotated, Any, Literal, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,17 +50,14 @@ _LEAST_QUEUED = 64
 """Fewest samples queued in a run."""
 _CENTRED = 0.005
 """Difference of a measured drive that counts as none: 50 mV of 10 V, more than any card's error."""
+_LINE = "port0/line"
 _COUNTER_LEAD = 1
 """Points at rest before a waveform with counters: their first edge is 2 clocks after their start or later."""
 
-_MARKERS = {"line_marker": MARKER_LINE, "scan_marker": MARKER_SCAN, "backward_marker": LEVEL_BACKWARD}
-_KEYS = {bit: key for key, bit in _MARKERS.items()}
-_DEFAULT_OUTPUTS: dict[object, dict[str, str]] = {
-    "digital": dict(zip(_MARKERS, ("port0/line0", "port0/line1", "port0/line2"), strict=True)),
-    "counters": {"scan_marker": "ctr0"},
-}
-_OUTPUTS = {"digital": re.compile(r"port0/line(\d|[12]\d|3[01])"), "counters": re.compile(r"ctr\d")}
+_KEYS = {MARKER_LINE: "line_marker", MARKER_SCAN: "scan_marker", LEVEL_BACKWARD: "backward_marker"}
 
+MarkerOutput = Annotated[str, Field(pattern=r"^(port0/line(\d|[12]\d|3[01])|ctr\d)$")]
+"""Line or counter of the card, such as port0/line1 or ctr0."""
 Terminal = Annotated[str, Field(pattern=r"^(/[\w-]+/)?[A-Za-z]\w*$")]
 """Terminal of the card, such as PFI0, or of another device, such as /Dev2/PFI0."""
 
@@ -80,14 +72,11 @@ class NidaqConfig(GalvoConfig):
     channel: Annotated[str, Field(pattern=r"^ao\d+$")] = "ao0"
     full_scale: Annotated[Volts, Field(gt=0, le=10)] = 10.0
     """Voltage at drive 1; at drive -1 it is the negative of that."""
-    markers: Literal["digital", "counters"] = "digital"
-    """digital: hardware-timed lines of port 0. counters: counter outputs, for cards without such lines; they can only
-    do markers that are periodic over the whole waveform."""
-    line_marker: str | None = None
-    scan_marker: str | None = None
-    backward_marker: str | None = None
-    """Line or counter of each marker; null: not wired. Without these keys: port0/line0 to line2, or ctr0 for the scan
-    marker alone."""
+    line_marker: MarkerOutput | None = "port0/line0"
+    scan_marker: MarkerOutput | None = "port0/line1"
+    backward_marker: MarkerOutput | None = "port0/line2"
+    """Output of each marker; null: not wired. port0/lineN: a line with a clock. ctrN: a counter, for cards without such
+    lines; it can only do a marker that is periodic over the whole waveform."""
     counted_at: Terminal | None = None
     """Terminal at which counters see the sample clock; None: they take it inside the card."""
     clock: Terminal = "onboard"
@@ -106,23 +95,11 @@ class NidaqConfig(GalvoConfig):
     buffer: Annotated[Seconds, Field(ge=0.02, le=2)] = 0.2
     """Duration of the samples queued in host and card: the host may be late by as much, and a stop takes as long."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_in(cls, fields: Any) -> Any:
-        if not isinstance(fields, dict):
-            return fields
-        outputs = _DEFAULT_OUTPUTS.get(fields.get("markers", "digital"), {})
-        return {**outputs, **fields}
-
     @model_validator(mode="after")
     def _check_wiring(self) -> Self:
-        outputs = self.outputs
-        for name in outputs.values():
-            if not _OUTPUTS[self.markers].fullmatch(name):
-                wanted = "a line such as port0/line1" if self.markers == "digital" else "a counter such as ctr0"
-                raise ValueError(f"marker output {name!r} with markers: {self.markers}; give {wanted}, or null")
-        if len(set(outputs.values())) < len(outputs):
-            raise ValueError(f"marker outputs {', '.join(outputs.values())} name one twice; give each its own")
+        outputs = list(self.outputs.values())
+        if len(set(outputs)) < len(outputs):
+            raise ValueError(f"marker outputs {', '.join(outputs)} name one twice; give each its own, or null")
         if (self.clock == "onboard") != (self.clock_rate is None):
             raise ValueError(f"clock {self.clock} with clock_rate {self.clock_rate}; give a terminal and its rate")
         if self.clock_rate is not None and not LOWEST_RATE_HZ <= self.clock_rate <= self.max_point_rate:
@@ -138,6 +115,16 @@ class NidaqConfig(GalvoConfig):
         """Line or counter by marker bit."""
         return {bit: name for bit, key in _KEYS.items() if (name := getattr(self, key)) is not None}
 
+    @property
+    def lines(self) -> dict[int, int]:
+        """Number of the line by marker bit."""
+        return {bit: int(name[len(_LINE) :]) for bit, name in self.outputs.items() if name.startswith(_LINE)}
+
+    @property
+    def counters(self) -> dict[int, str]:
+        """Counter by marker bit."""
+        return {bit: name for bit, name in self.outputs.items() if not name.startswith(_LINE)}
+
 
 class NidaqDac:
     """An NI card as a `Dac`. It has tasks only while something is written; `release` ends those of a run."""
@@ -148,11 +135,8 @@ class NidaqDac:
         self.card = NiCard(address)
         self.name = self.card.name
         self.mirror = f"{self.card.device}/{config.channel}"
-        names = config.outputs.values() if config.markers == "digital" else ()
-        self.lines = ",".join(f"{self.card.device}/{name}" for name in names)
+        self.lines = ",".join(f"{self.card.device}/{_LINE}{line}" for line in config.lines.values())
         """The marker lines as NI-DAQmx takes them; empty: none."""
-        self.tasks = ExitStack()
-        """Tasks of the present run. Closing it stops counters and marker lines first, then the mirror."""
         self._clocks: dict[float, Fraction] = {}
         """Exact rate by requested rate: a rate that was returned once is returned again."""
         try:
@@ -176,7 +160,7 @@ class NidaqDac:
         if not timed:
             self._refuse("no analogue output with a sample clock", "use another card")
         if not lines_hz:
-            self._refuse("no digital lines with a sample clock", "set markers: counters")
+            self._refuse("no digital lines with a sample clock", "make each marker a counter or null")
         ranges = list(zip(ends[::2], ends[1::2], strict=True))
         if not any(low <= -config.full_scale and config.full_scale <= high for low, high in ranges):
             offered = " or ".join(f"{low:g} to {high:g} V" for low, high in ranges)
@@ -229,7 +213,6 @@ class NidaqDac:
         """End all tasks with the markers low. The mirror stays where it is if the card can measure where, else it jumps
         to the centre. Returns its drive."""
         self.release()
-        self.dark()
         drive = self.level()
         if drive is None or abs(drive) < _CENTRED:
             self._centre()
@@ -255,14 +238,15 @@ class NidaqDac:
 
     def release(self) -> None:
         """End the tasks of a run, if there is one: markers low first, then the mirror, which keeps its level."""
-        with self.card.errors():
-            self.tasks.close()
+        with self.card.errors(), ExitStack() as steps:
+            steps.callback(self.card.clear)
+            steps.callback(self.dark)
+            self.card.clear(keep=1)
 
     def close(self) -> None:
         """Markers low, the mirror at the centre, and the channel to the server closed."""
         try:
             self.release()
-            self.dark()
             self._centre()
         finally:
             self.card.disconnect()
@@ -274,34 +258,21 @@ class NidaqDac:
             writer.write_many_sample(np.zeros(1), _WRITE_S)
 
 
-class PulseTrain(NamedTuple):
-    """Pulses of a marker: first point, width and period of a pulse, in points, and their number in a waveform."""
+def pulse_train(high: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
+    """The pulses that a counter has to make for a marker that is high at these points, bool (points,): first point,
+    width and period of a pulse in points, and their number. None: it is never high.
 
-    first: int
-    width: int
-    period: int
-    number: int
-
-
-def pulse_train(high: NDArray[np.bool_]) -> PulseTrain | None:
-    """The pulses that a counter has to make for a marker that is high at these points, bool (points,). None: it is
-    never high.
-
-    A counter can only make equal pulses at equal distances. Raises ValueError for others, with their widths and
-    distances.
+    A counter can only make equal pulses at equal distances. Raises ValueError for others, with widths and distances.
     """
     if not high.any():
         return None
     edges = np.flatnonzero(np.diff(high.astype(np.int8), prepend=0, append=0))
-    begins, ends = edges[::2], edges[1::2]
+    begins, widths = edges[::2], edges[1::2] - edges[::2]
     periods = np.diff(begins, append=begins[0] + len(high))
-    widths = ends - begins
-    if (periods != periods[0]).any() or (widths != widths[0]).any():
-        raise ValueError(f"pulses of {widths.min()} to {widths.max()} points, {periods.min()} to {periods.max()} apart")
-    train = PulseTrain(int(begins[0]), int(widths[0]), int(periods[0]), len(begins))
-    if train.width < 2 or train.period - train.width < 2:
-        raise ValueError(f"{train.width} of {train.period} points high, where a counter needs 2 high and 2 low")
-    return train
+    if np.ptp(periods) or np.ptp(widths) or widths[0] < 2 or periods[0] - widths[0] < 2:
+        found = f"pulses of {widths.min()} to {widths.max()} points, {periods.min()} to {periods.max()} apart"
+        raise ValueError(f"{found}; a counter makes equal ones, 2 points or more high and low")
+    return int(begins[0]), int(widths[0]), int(periods[0]), len(begins)
 
 
 class NidaqRun:
@@ -318,7 +289,7 @@ class NidaqRun:
         self._sent = self._played = 0
         self._end: int | None = None
         """Number of samples up to the last point; copies of it follow. None: points are still to be sent."""
-        if self._plays and config.markers == "counters":
+        if self._plays and config.counters:
             source.pad_start(_COUNTER_LEAD)
 
     def begin(self) -> None:
@@ -340,8 +311,7 @@ class NidaqRun:
 
     def _begin(self) -> None:
         dac, card, config = self._dac, self._card, self._dac.config
-        self._mirror = dac.tasks.enter_context(card.task())
-        dac.tasks.callback(dac.dark)
+        self._mirror = card.new_task()
         dac.add_mirror(self._mirror)
         source = card.terminal(config.clock) if self._plays and config.clock != "onboard" else ""
         actual_hz = card.tune(self._mirror, self._clock_hz, source, 2 * self._most)
@@ -351,7 +321,7 @@ class NidaqRun:
         self._writers = [self._mirror_writer()]
         if self._plays and dac.lines:
             # Not for a way to rest: NI-DAQmx is known to refuse buffers in which all lines are low.
-            lines = dac.tasks.enter_context(card.task())
+            lines = card.new_task()
             dac.add_lines(lines)
             card.tune(lines, self._clock_hz, card.terminal("ao/SampleClock"), 2 * self._most)
             self._tasks.insert(0, lines)
@@ -359,7 +329,7 @@ class NidaqRun:
         for task in self._tasks:
             task.out_stream.regen_mode = card.const.RegenerationMode.DONT_ALLOW_REGENERATION
             task.out_stream.output_buf_size = 2 * self._most
-        self._counters = dac.tasks.enter_context(ExitStack())
+        self._uncounted = len(self._tasks)
         if self._plays:
             self._wire()
         self._send(self._most)
@@ -374,11 +344,10 @@ class NidaqRun:
 
     def _line_writer(self, task: Any) -> Callable[[PointSlice], None]:
         writer = self._card.writers.DigitalSingleChannelWriter(task.out_stream, auto_start=False)
-        lines = {bit: int(name.rpartition("line")[2]) for bit, name in self._dac.config.outputs.items()}
 
         def write(points: PointSlice) -> None:
             words = np.zeros(len(points), np.uint32)
-            for bit, line in lines.items():
+            for bit, line in self._dac.config.lines.items():
                 words |= ((points.markers & bit) != 0).astype(np.uint32) << np.uint32(line)
             writer.write_many_sample_port_uint32(words, _WRITE_S)
 
@@ -392,25 +361,22 @@ class NidaqRun:
         for what, where in ((signal.SAMPLE_CLOCK, config.clock_out), (signal.START_TRIGGER, config.start_out)):
             if where is not None:
                 self._mirror.export_signals.export_signal(what, card.terminal(where))
-        if config.markers == "counters":
-            for bit, name in config.outputs.items():
-                train = pulse_train((self.source.waveform.markers & bit) != 0)
-                if train is not None:
-                    self._tasks.insert(0, self._counter(name, train))
+        for bit, name in config.counters.items():
+            if train := pulse_train((self.source.waveform.markers & bit) != 0):
+                self._tasks.insert(0, self._counter(name, *train))
 
-    def _counter(self, name: str, train: PulseTrain) -> Any:
+    def _counter(self, name: str, first: int, width: int, period: int, number: int) -> Any:
         """A task that makes a marker by counting the mirror's sample clock."""
         card = self._card
-        task = self._counters.enter_context(card.task())
+        task = card.new_task()
         task.co_channels.add_co_pulse_chan_ticks(
             f"{card.device}/{name}",
             card.terminal(self._dac.config.counted_at or "ao/SampleClock"),
-            # Point i begins with clock i + 1.
-            initial_delay=_COUNTER_LEAD + train.first + 1,
-            low_ticks=train.period - train.width,
-            high_ticks=train.width,
+            initial_delay=_COUNTER_LEAD + first + 1,  # point i begins with clock i + 1
+            low_ticks=period - width,
+            high_ticks=width,
         )
-        if (pulses := train.number * self.source.repeats) > 1:
+        if (pulses := number * self.source.repeats) > 1:
             task.timing.cfg_implicit_timing(card.const.AcquisitionType.FINITE, samps_per_chan=pulses)
         return task
 
@@ -437,7 +403,7 @@ class NidaqRun:
             self._ask()
             if stopping.is_set() and not stopped:
                 stopped = True
-                self._counters.close()
+                self._card.clear(keep=self._uncounted)
                 if self._awaited and not self._played:  # neither clock nor trigger has come
                     self.source.give_back()
                     self.source.stop()
@@ -503,7 +469,7 @@ class Nidaq(DacScanner):
     def __init__(self, dac: NidaqDac, config: NidaqConfig) -> None:
         """Take over `dac`, which is closed with the scanner: marker lines low, mirror to the centre."""
         super().__init__(dac, config)
-        self._outputs = config.outputs if config.markers == "counters" else {}
+        self._counters = config.counters
         try:
             self._position = dac.halt()
             if self._position:
@@ -513,14 +479,12 @@ class Nidaq(DacScanner):
             raise
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
-        for bit, name in self._outputs.items():
+        for bit, name in self._counters.items():
             try:
                 pulse_train((waveform.markers & bit) != 0)
             except ValueError as error:
-                raise LimitExceeded(
-                    f"{self.name}: {_KEYS[bit]} is not periodic ({error}), counter {name} cannot make it; "
-                    "use markers: digital, or set it to null"
-                ) from None
+                refused = f"{self.name}: {name} cannot make the {_KEYS[bit]}: {error}; give it a line, or null"
+                raise LimitExceeded(refused) from None
         super()._do_load(waveform, repeats, clock_hz)
 
     def _do_start(self) -> None:

@@ -3,17 +3,16 @@
 The package nidaqmx gives both the same calls. It sets no deadline on those to a server, so every one gets one here. Its
 errors become ours, in one line with NI's code.
 
-Sources: `ni/nidaqmx-python` cbba502 (error_codes.py, errors.py, _grpc_interpreter.py, task/_timing.py) and
-`ni/grpc-device` c1ddf51 (README.md). No code was taken.
+Sources: docs/reference/devices/nidaq.md.
 """
 
 import math
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from fractions import Fraction
 from importlib import import_module
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from drivers.errors import (
@@ -56,6 +55,8 @@ _CAUSES: tuple[tuple[type[DeviceError], str, frozenset[int]], ...] = (
     (DeviceTimeout, "check that its clock runs", frozenset((-200474, -200292, -50400))),
 )
 """Errors of ours, what to do, and NI's codes that mean them. All other codes are `CommandRefused`."""
+_NO_TASK = -200088
+"""Code for a task that was cleared, by a call that was interrupted."""
 _UNSUPPORTED = (-200197, -200452)
 """Codes for a property that a card does not have."""
 
@@ -75,6 +76,7 @@ class NiCard:
         modules = ("nidaqmx", "nidaqmx.constants", "nidaqmx.stream_writers", "nidaqmx.system", "nidaqmx.errors")
         self._ni, self.const, self.writers, system, errors = map(_import, modules)
         self._error: type[Exception] = errors.Error
+        self._tasks: list[Any] = []
         self._channel = _connect(server) if server else None
         self._options = self._ni.GrpcSessionOptions(self._channel, "") if self._channel else None
         try:
@@ -98,9 +100,40 @@ class NiCard:
         except self._error as error:
             raise self._ours(error) from error
 
-    def task(self) -> Any:
-        """A new `nidaqmx.Task`, to be used as a context that closes it. Closing it also ends what it does."""
-        return self._ni.Task(grpc_options=self._options)
+    def new_task(self) -> Any:
+        """A new `nidaqmx.Task`, until `clear`."""
+        self._tasks.append(self._ni.Task(grpc_options=self._options))
+        return self._tasks[-1]
+
+    @contextmanager
+    def task(self) -> Iterator[Any]:
+        """A new `nidaqmx.Task`, which is cleared at the end. That also ends what it does."""
+        task = self.new_task()
+        try:
+            yield task
+        finally:
+            self._clear(task)
+
+    def clear(self, keep: int = 0) -> None:
+        """Clear all tasks but for so many of the oldest, the latest first. An interrupt leaves the rest for later."""
+        failed: Exception | None = None
+        while len(self._tasks) > keep:
+            try:
+                self._clear(self._tasks[-1])
+            except self._error as error:
+                failed = error
+        if failed is not None:
+            raise failed
+
+    def _clear(self, task: Any) -> None:
+        try:
+            task.close()
+        except self._ni.DaqError as error:
+            if error.error_code != _NO_TASK:
+                raise
+        finally:
+            if task._handle is None:  # else it was interrupted
+                self._tasks.remove(task)
 
     def terminal(self, name: str) -> str:
         """The full name of a terminal; one without a device is the card's own."""
@@ -117,14 +150,12 @@ class NiCard:
 
     def nearest_clock(self, task: Any, wanted_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The rate nearest to `wanted_hz`, within the limits, to which the sample clock of a task can be set."""
-        wanted = Fraction(wanted_hz)
-        clock_hz = self.tune(task, wanted)
+        clock_hz = self.tune(task, Fraction(wanted_hz))
         base_hz = self._timebase(task)
         if base_hz is None:
             return clock_hz
-        near = [base_hz / n for n in (math.floor(base_hz / wanted), math.ceil(base_hz / wanted)) if n]
-        possible = [hz for hz in near if low_hz <= hz <= high_hz]
-        return self.tune(task, min(possible, key=lambda hz: abs(hz - wanted), default=wanted))
+        divisor = max(round(base_hz / Fraction(wanted_hz)), math.ceil(base_hz / Fraction(high_hz)))
+        return self.tune(task, base_hz / min(divisor, math.floor(base_hz / Fraction(low_hz))))
 
     def tune(self, task: Any, rate_hz: Fraction, source: str = "", samples: int = 1000) -> Fraction:
         """Let a task run until it is stopped, with this sample clock. Returns the exact rate that the card reads back.
@@ -136,14 +167,7 @@ class NiCard:
         if source:
             return rate_hz
         base_hz = self._timebase(task)
-        if base_hz is None:
-            return Fraction(timing.samp_clk_rate)
-        divisor = base_hz / rate_hz
-        # Rounded to a float, a possible rate may lie on the wrong side of itself where the driver cuts off.
-        for shift in (Fraction(1, 4), Fraction(-1, 4)):
-            if divisor.denominator == 1 and timing.samp_clk_timebase_div != divisor:
-                timing.samp_clk_rate = float(base_hz / (divisor + shift))
-        return base_hz / int(timing.samp_clk_timebase_div)
+        return Fraction(timing.samp_clk_rate) if base_hz is None else base_hz / int(timing.samp_clk_timebase_div)
 
     def _timebase(self, task: Any) -> Fraction | None:
         """Rate of the timebase that is divided; None: this card does not say."""
@@ -204,22 +228,16 @@ def _connect(server: str) -> Any:
 def _aside(work: Callable[[], Value], limit_s: float) -> Value:
     """Do work in a thread of its own. Ctrl-C ends the wait for it, never the work: an interrupt inside gRPC can leave
     its locks closed for good. Raises `DeviceTimeout` after the limit."""
-    answers: SimpleQueue[Callable[[], Value]] = SimpleQueue()
+    answer: Future[Value] = Future()
 
-    def answer() -> None:
+    def act() -> None:
         try:
-            value = work()
-            answers.put(lambda: value)
+            answer.set_result(work())
         except BaseException as error:
-            failure = error
+            answer.set_exception(error)
 
-            def fail() -> Value:
-                raise failure
-
-            answers.put(fail)
-
-    threading.Thread(target=answer, daemon=True).start()
+    threading.Thread(target=act, daemon=True).start()
     try:
-        return answers.get(timeout=limit_s)()
-    except Empty:
+        return answer.result(limit_s)
+    except TimeoutError:
         raise DeviceTimeout(f"nidaq: gRPC hangs for {limit_s:g} s; start the program anew") from None

@@ -27,6 +27,7 @@ from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
 from tests.wire.etherdream import let_pass, open_etherdream, turning, wired
 from tests.wire.lasercube import LaserCubeModel
 from tests.wire.lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
+from tests.wire.ni_bench import ni_bench
 from tests.wire.scanners import opened
 from tests.wire.syncs import Board, PulseBox, board, pulse_box, teensy
 
@@ -96,6 +97,18 @@ def emulated_etherdream(folder: Path, **settings: Any) -> Iterator[ScannerCase]:
         yield ScannerCase(device, partial(turning, wire), partial(let_pass, wire))
 
 
+@contextmanager
+def nidaq(folder: Path, **config: Any) -> Iterator[ScannerCase]:
+    with ni_bench() as bench, bench.open(**config) as device:
+
+        def let_pass(seconds: float) -> None:
+            ends_s = bench.now_s() + seconds
+            eventually(lambda: not device.status.moving or bench.now_s() >= ends_s)
+            bench.clock.sleep(ends_s - bench.now_s())
+
+        yield ScannerCase(device, lambda: bench.model.moving(bench.now_s()), let_pass)
+
+
 def _on_board(board: Board | PulseBox, device: SyncSource, after_s: float = 1e-6, **settings: Any) -> SyncCase:
     """after_s: until a scan marker comes."""
 
@@ -163,6 +176,7 @@ SCANNERS: dict[str, Factory] = {
     "lasercube, emulated": partial(emulated_scanner, kind="lasercube", make=LaserCubeModel),
     "etherdream, emulated": emulated_etherdream,
     "etherdream by its page, emulated": partial(emulated_etherdream, by_page=True),
+    "nidaq, emulated": nidaq,
 }
 SYNCS: dict[str, Factory] = {
     "replay": partial(stand_in, slot="sync"),

@@ -38,6 +38,7 @@ from tests.wire.usb.umockdev import PRELOAD, UmockdevBus
 WIDTH, HEIGHT = 64, 16
 COLUMNS, EXPOSURES = 20, 12
 POWER = "20 mW"
+CARD_BUFFER_S = 0.5
 STILL_S = 1e-3
 """A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
 STEP_S = 5e-5
@@ -245,6 +246,10 @@ def _config(laser: str, ports: dict[str, str], silence: str, scanner: str) -> di
     if scanner == "etherdream":
         del content["scanner"]["frame"]
         content["scanner"] |= {"kind": scanner, "buffer": "220 ms"}
+    if scanner == "nidaq":
+        del content["scanner"]["frame"]
+        card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
+        content["scanner"] |= card
     content["laser"]["kind"] = laser
     if laser == "ttl":
         content["laser"] = {"kind": laser, "power": POWER, "max_power": "50 mW"}  # a real one has no port

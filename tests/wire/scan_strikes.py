@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from drivers.guard import GuardLimits
 from tests.wire.lasers import eventually
-from tests.wire.scan_rig import STEP_S, Applications, ScanBench, scan_bench
+from tests.wire.scan_rig import CARD_BUFFER_S, STEP_S, Applications, ScanBench, scan_bench
 
 GONE_S = 0.1
 """Light has to be gone after this, at the 99.9th percentile..."""
@@ -54,6 +54,7 @@ class ScanStrike:
     labours: bool = False
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
+    scanner: str = "helios"
 
 
 def _signal(number: int) -> Callable[[ScanBench], None]:
@@ -111,6 +112,19 @@ def _restart_scanner(bench: ScanBench) -> None:
 
 ETHERDREAM_S = 0.5
 """It plays what is queued: light is gone after this."""
+
+
+def _reset_card(bench: ScanBench) -> None:
+    with bench.world.scanner_plug.lock:
+        bench.world.scanner.reset(time.monotonic())
+
+
+def _delay_card(bench: ScanBench) -> None:
+    """Its points run dry, and markers keep their last level."""
+    with bench.world.scanner_plug.lock:
+        time.sleep(2 * CARD_BUFFER_S)
+
+
 SCAN_STRIKES = {
     "application killed": ScanStrike(_signal(signal.SIGKILL), at_once=True),
     "application stopped": ScanStrike(_signal(signal.SIGSTOP)),
@@ -149,6 +163,12 @@ SCAN_STRIKES = {
     ),
     "interlock opened": ScanStrike(_open_interlock, own_end=True),
     "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
+    # An NI card's scan marker stays as it was.
+    "killed, ni card": ScanStrike(_signal(signal.SIGKILL), scanner="nidaq"),
+    "ni card's server gone": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="nidaq"),
+    "ni card's server hangs": ScanStrike(lambda bench: bench.world.scanner_plug.hang(), own_end=True, scanner="nidaq"),
+    "ni card reset": ScanStrike(_reset_card, own_end=True, scanner="nidaq"),
+    "ni card runs dry": ScanStrike(_delay_card, own_end=True, scanner="nidaq"),
 }
 
 

@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -30,6 +31,7 @@ from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire import syncs
 from tests.wire.etherdream import wired
 from tests.wire.lasers import bring_up, wire
+from tests.wire.ni_bench import ni_bench
 from tests.wire.spb_device import model
 from tests.wire.syncs import board, pulse_box
 
@@ -73,6 +75,9 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
         monkeypatch.setattr("drivers.scanners.helios.SystemClock", lambda: clock)
         monkeypatch.setattr("drivers.scanners.etherdream.SystemClock", lambda: dream._clock)
         monkeypatch.setattr("drivers.scanners.etherdream.Endpoint", lambda port: dream.endpoint)
+        card = stack.enter_context(ni_bench(clock))
+        monkeypatch.setattr("drivers.scanners.nidaq.SystemClock", lambda: clock)
+        monkeypatch.setenv("CARD", f"grpc={card.server.address}/Dev1")
         monkeypatch.setattr(time, "sleep", clock.sleep)
         yield {"laser": laser, "ibeam": second, "sync": sync.model, "scanner": helios}
         assert not box.pins
@@ -88,6 +93,7 @@ def test_the_cells_of_the_page_run_as_they_are_written(
         "192.168.1.10": "emulated:sync",
         "127.0.0.1:9999": "emulated:spad",
     }
+    addresses["Dev1"] = os.environ["CARD"]
     for real, emulated in addresses.items():
         cell = cell.replace(real, emulated)
     exec(compile(cell, str(PAGE), "exec"), {})

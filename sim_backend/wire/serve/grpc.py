@@ -15,7 +15,7 @@ from drivers.errors import DeviceError
 from drivers.optional_packages import install_command
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.nidaq import Call
-from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, SessionError
+from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError
 from sim_backend.wire.serve.tcp import HOST
 from sim_backend.wire.serve.wire_server import WireServer
 
@@ -39,7 +39,7 @@ class GrpcModel(Protocol):
         """Note that a call came."""
 
     def call(self, call: Call, now_s: float) -> dict[str, Any] | None:
-        """Fields of the answer to a call; None: not yet. Raises `DaqmxError` or `SessionError`."""
+        """Fields of the answer to a call; None: not yet. Raises `DaqmxError`."""
 
     def advance(self, now_s: float) -> None:
         """Let time pass."""
@@ -125,11 +125,9 @@ class GrpcServer(WireServer[GrpcModel]):
         except DaqmxError as error:
             trailing = [("ni-error", str(error.code))]
             if rpc.startswith("Write"):
-                trailing.append(("ni-samps-per-chan-written", str(error.written or 0)))
+                trailing.append(("ni-samps-per-chan-written", str(error.written)))
             context.set_trailing_metadata(trailing)
             context.abort(self._grpc.StatusCode.UNKNOWN, str(error))
-        except SessionError as error:
-            context.abort(self._grpc.StatusCode[error.status], str(error))
         assert found is not None, "an abort raises"
         name = found.pop("task", None)
         response = answer(**found)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
-from tests.campaigns.devices import blanking, lasers, scanners, spad512s, spb_usb, syncs
+from tests.campaigns.devices import blanking, lasers, ni_cards, scanners, spad512s, spb_usb, syncs
 from tests.campaigns.devices.prawndo import PRAWNDO
 from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
 from tests.campaigns.devices.teensy import TEENSY
@@ -27,6 +27,7 @@ SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
     "etherdream": scanners.etherdream_sequence,
+    "nidaq": ni_cards.sequence,
     "spb-usb": spb_usb.sequence,
     "spad512s": spad512s.sequence,
     "blanking": blanking.sequence,

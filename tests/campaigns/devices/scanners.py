@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,8 +80,12 @@ def sequence(subject: Subject, seed: int) -> Ending:
     clock = VirtualClock()
     model = subject.model()
     plugged = plug(FaultyUsb(model, schedule, late_s=rng.choice((0.001, 0.02, 0.2))), clock)
-    opens = partial(open_scanner, subject.kind, plugged.bus, plugged.clock, **subject.config)
-    return _ending(lambda: _judged(subject, rng, opens, plugged.now_s, model.history), schedule, plugged.now_s)
+
+    def act() -> str:
+        with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
+            return judged(subject, rng, device, wave(device), plugged.now_s, model.history)
+
+    return _ending(act, schedule, plugged.now_s)
 
 
 def _ending(act: Callable[[], str], schedule: FaultSchedule, now_s: Callable[[], float]) -> Ending:
@@ -118,11 +121,12 @@ def etherdream_sequence(seed: int) -> Ending:
         capacity=rng.choice((1799, 3899)),
     )
     with wired(model, schedule) as wire:
-        opens = partial(open_etherdream, wire, max_point_rate="25 kHz", buffer=rng.choice(("20 ms", "60 ms")))
+        buffer = rng.choice(("20 ms", "60 ms"))
 
         def act() -> str:
             try:
-                return _judged(ETHERDREAM, rng, opens, lambda: wire.now_s, model.history, clock_error)
+                with open_etherdream(wire, max_point_rate="25 kHz", buffer=buffer) as device:
+                    return judged(ETHERDREAM, rng, device, wave(device), lambda: wire.now_s, model.history, clock_error)
             finally:
                 wire._clock.sleep(0.5)
                 assert not model.moving(wire.now_s), "it plays for ever"
@@ -156,35 +160,35 @@ class StruckEtherDream(EtherDreamModel):
         super().receive(data, now_s)
 
 
-def _judged(
+def judged(
     subject: Subject,
     rng: random.Random,
-    opens: Callable[[], BeamScanner],
+    device: BeamScanner,
+    waveform: ScanWaveform,
     now_s: Callable[[], float],
     history: DacHistory,
     clock_error: float = 0.0,
 ) -> str:
-    with opens() as device:
-        for _ in range(rng.randrange(1, 3)):
-            repeats = rng.randrange(3, 8)
-            waveform = wave(device)
-            clock = device.load(waveform, repeats)
-            began_s = now_s()
-            device.start()
-            stopped = rng.random() < 0.3
-            if stopped:
-                time.sleep(rng.random() * 0.003)
-                device.stop()
-            else:
-                finish(device)
-            fault = device.status.fault
-            if fault is not None:
-                assert "\n" not in fault, "a fault of several lines"
-                return "fault"
-            put_out = Played(subject, history, float(clock) * (1 + clock_error), began_s, now_s())
-            put_out.require(waveform, repeats, stopped=stopped)
-            if rng.random() < 0.5:
-                device.park()
+    """Play the waveform once or twice, to the end or to a stop; how that ended. AssertionError if it ended wrong."""
+    for _ in range(rng.randrange(1, 3)):
+        repeats = rng.randrange(3, 8)
+        clock = device.load(waveform, repeats)
+        began_s = now_s()
+        device.start()
+        stopped = rng.random() < 0.3
+        if stopped:
+            time.sleep(rng.random() * 0.003)
+            device.stop()
+        else:
+            finish(device)
+        fault = device.status.fault
+        if fault is not None:
+            assert "\n" not in fault, "a fault of several lines"
+            return "fault"
+        put_out = Played(subject, history, float(clock) * (1 + clock_error), began_s, now_s())
+        put_out.require(waveform, repeats, stopped=stopped)
+        if rng.random() < 0.5:
+            device.park()
     return "complete"
 
 

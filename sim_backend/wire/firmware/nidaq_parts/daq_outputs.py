@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from sim_backend.wire.firmware.helios import DacHistory
 
 Array = NDArray[np.float64]
-Ticks = NDArray[np.int64]
 
 EARLY = 1e-4
 """Part of a clock's period by which an edge counts as past before its time: times are sums of rounded numbers."""
@@ -61,60 +60,28 @@ class Span:
         """Values at times after the first edge."""
         last = self.count - 1 if math.isfinite(self.count) else 2**62
         index = np.floor((time_s - self.edges.first_s) / self.edges.period_s + EARLY)
-        return self._at(np.clip(index, 0, last).astype(np.int64))
+        at = self.first + np.clip(index, 0, last).astype(np.int64)
+        return np.asarray(self.data[at % len(self.data)], np.float64)
 
     def rising(self, from_s: float, until_s: float, high_before: bool) -> Array:
         """Times of rising edges of the value in [from_s, until_s). high_before: whether it was high before the span."""
-        edges = self.edges
+        edges, size = self.edges, len(self.data)
         low = max(0, math.ceil((from_s - edges.first_s) / edges.period_s - EARLY))
         end = int(min(self.count, math.ceil((until_s - edges.first_s) / edges.period_s - EARLY)))
         if end <= low:
             return np.empty(0)
-        at = self._rises(low, end)
+        turns = np.arange(low // size, end // size + 1, dtype=np.int64) * size
+        at = (turns[:, None] + np.sort((self._ups - self.first) % size)[None, :]).ravel()
         at = at[(at >= max(low, 1)) & (at < end)]
-        if low == 0 and not high_before and self._at(np.zeros(1, np.int64))[0] > 0:
-            at = np.concatenate([np.zeros(1, np.int64), at])
+        if low == 0 and not high_before and self.data[self.first % size] > 0:
+            at = np.append(0, at)
         return np.asarray(edges.first_s + at * edges.period_s, np.float64)
 
     @cached_property
-    def _ups(self) -> Ticks:
+    def _ups(self) -> NDArray[np.int64]:
+        """Indices of samples that are high after a low one."""
         high = self.data > 0
-        ups: Ticks = np.flatnonzero(high & ~np.roll(high, 1)).astype(np.int64)
-        return ups
-
-    def _at(self, index: Ticks) -> Array:
-        return np.asarray(self.data[(self.first + index) % len(self.data)], np.float64)
-
-    def _rises(self, low: int, end: int) -> Ticks:
-        """Numbers of samples that rise above the one before, at least all of those in [low, end), ascending."""
-        return _repeated((self._ups - self.first) % len(self.data), len(self.data), low, end)
-
-
-@dataclass(frozen=True, eq=False)
-class Pulses(Span):
-    """Pulses of a counter, in ticks of its clock: `delay` ticks at rest, then `high` and `low` ticks in turn."""
-
-    delay: int = 0
-    high: int = 1
-    low: int = 1
-    inverted: bool = False
-    """Whether the output rests high and its pulses are low."""
-
-    def _at(self, index: Ticks) -> Array:
-        active = (index >= self.delay) & ((index - self.delay) % (self.high + self.low) < self.high)
-        return np.asarray(active != self.inverted, np.float64)
-
-    def _rises(self, low: int, end: int) -> Ticks:
-        period = self.high + self.low
-        first = self.delay + (self.high if self.inverted else 0)
-        at = _repeated(np.array([first % period], np.int64), period, low, end)
-        return at[at >= first]
-
-
-def _repeated(offsets: Ticks, period: int, low: int, end: int) -> Ticks:
-    """Ascending numbers offset + n * period that cover [low, end)."""
-    turns = np.arange(low // period, end // period + 1, dtype=np.int64) * period
-    return (turns[:, None] + np.sort(offsets)[None, :]).ravel()
+        return np.flatnonzero(high & ~np.roll(high, 1)).astype(np.int64)
 
 
 class Output:
@@ -181,28 +148,23 @@ class Output:
                 high = bool(span.values(np.array([end_s - EARLY * span.edges.period_s]))[0] > 0)
         return np.concatenate(found)
 
-    def __len__(self) -> int:
-        return len(self._spans)
-
 
 class CardHistory(DacHistory):
     """The galvo's drive and the marker lines of a card. Digital lines hold their level when nothing is played."""
 
-    def __init__(self, galvo: Output, full_scale_v: float, lines: Mapping[int, Output]) -> None:
-        """galvo: the output in V. lines: outputs by the number of their line in `DacHistory`; others are always low."""
+    def __init__(self, galvo: Output, lines: Mapping[int, Output]) -> None:
+        """galvo: the output in V, 10 V at drive 1. lines: outputs by the number of their line in `DacHistory`."""
         super().__init__(0.0, lines=4)
-        self._galvo, self._full_scale_v, self._outputs = galvo, full_scale_v, dict(lines)
+        self._galvo, self._outputs = galvo, lines
 
     def command(self, time_s: Array) -> Array:
         """Normalised drive at the given times, in the steps of the DAC and without the mirror's lag."""
-        return self._galvo.values(time_s) / self._full_scale_v
+        return self._galvo.values(time_s) / 10
 
     def level(self, line: int, time_s: Array) -> NDArray[np.uint8]:
         """Level of a marker line at the given times."""
-        output = self._outputs.get(line)
-        return np.zeros(time_s.shape, np.uint8) if output is None else (output.values(time_s) > 0).astype(np.uint8)
+        return (self._outputs[line].values(time_s) > 0).astype(np.uint8)
 
     def rising(self, line: int, from_s: float, until_s: float) -> Array:
         """Times of rising edges of a marker line in [from_s, until_s), ascending."""
-        output = self._outputs.get(line)
-        return np.empty(0) if output is None else output.rising(from_s, until_s)
+        return self._outputs[line].rising(from_s, until_s)
