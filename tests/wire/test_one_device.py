@@ -1,4 +1,4 @@
-"""One device without a rig: the cells of docs/how-to/devices.md against emulators, and lasers that are forgotten."""
+"""One device without a rig: the cells of docs/how-to/one-device.md against emulators, and lasers that are forgotten."""
 
 import gc
 import logging
@@ -35,10 +35,8 @@ from tests.wire.ni_bench import ni_bench
 from tests.wire.spb_device import model
 from tests.wire.syncs import board, pulse_box
 
-PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "devices.md"
-CELLS = [
-    cell.split("```")[0] for cell in PAGE.read_text().split("## One device in a notebook")[1].split("```python\n")[1:]
-]
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "one-device.md"
+*CELLS, EMULATED = (cell.split("```")[0] for cell in PAGE.read_text().split("```python\n")[1:])
 
 
 def frames(first: int, start_s: float, period_s: float, n: int) -> Any:
@@ -101,6 +99,11 @@ def test_the_cells_of_the_page_run_as_they_are_written(
     assert not lab["laser"].emitting
     assert not lab["ibeam"].emitting
     assert lab["sync"].status == 0 or lab["sync"].status == 5
+
+
+def test_the_cell_without_devices_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(EMULATED, str(PAGE), "exec"), {})
+    assert capsys.readouterr().out.split("\n")[1:] == ["True", "False", ""]
 
 
 MAKES: list[tuple[type[LineLaser], Callable[[], Any]]] = [
