@@ -3,6 +3,7 @@
 import logging
 from abc import abstractmethod
 from dataclasses import dataclass
+from numbers import Real
 
 from drivers.errors import DeviceFault, InterlockOpen, LimitExceeded
 from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
@@ -73,6 +74,8 @@ class LineLaser(Device):
         obey, raises `DeviceError` and tries to leave it dark.
         """
         self._require("arm", *OPEN_STATES)
+        if not isinstance(power_w, Real):
+            raise LimitExceeded(f"{self._name}: power is {power_w!r}; give a number of watts")
         limits = self.limits
         if not limits.min_power_w <= power_w <= limits.max_power_w:
             raise LimitExceeded(

@@ -23,6 +23,7 @@ lets light out only while the scan marker is high. So the light ends too if the 
 marker then falls.
 """
 
+_SLOWER = "make the command slower or smaller (in a scan: raise exposures or narrow command_range)"
 _ROUNDING = 1e-6
 """Share by which a computed speed may exceed its limit: differences of float64 commands are that uncertain."""
 
@@ -187,6 +188,8 @@ def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Frac
     seamless: whether the waveform repeats. The steps across its end are then checked like any other.
     """
     command = waveform.command
+    if not (isinstance(command, np.ndarray) and isinstance(waveform.markers, np.ndarray)):
+        raise LimitExceeded("commands and markers are no arrays; make them with numpy, float64 and uint8")
     points = len(command)
     if not 2 <= points <= limits.max_points:
         raise LimitExceeded(f"{points} points are outside 2 to {limits.max_points}; use a lower point rate")
@@ -214,4 +217,4 @@ def check_waveform(waveform: ScanWaveform, limits: ScannerLimits, clock_hz: Frac
         ("RMS acceleration of {:.6g} /s2 exceeds {:.6g} /s2;", rms, most_rms),
     ):
         if value > limit * (1 + _ROUNDING):
-            raise LimitExceeded(f"{what.format(value, limit)} raise exposures or narrow command_range")
+            raise LimitExceeded(f"{what.format(value, limit)} {_SLOWER}")

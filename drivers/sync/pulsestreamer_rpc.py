@@ -75,7 +75,9 @@ class JsonRpc:
         if isinstance(answer, dict) and answer.get("error") is not None:
             error = answer["error"]
             said = error.get("message", error) if isinstance(error, dict) else error
-            raise CommandRefused(f"{self._name} refuses {method}: {one_line(Exception(said))}; update its firmware")
+            raise CommandRefused(
+                f"{self._name} refuses {method}: {one_line(Exception(said))}; correct the call, or update its firmware"
+            )
         if not isinstance(answer, dict) or "result" not in answer:
             raise ProtocolError(
                 f"{self._name}: {text[:80]!r} is no answer to {method}; is {self._address} a Pulse Streamer?"
