@@ -179,7 +179,8 @@ class GuardProcess:
             self._ending = True
         for owned in self._owned.values():
             if self._tripped is None and owned.port_lost:
-                self._trip(DeviceDisconnected(f"{owned.device.name}: its port is lost; plug it in again"))
+                what = f"{owned.device.name}: its port or its program is lost"
+                self._trip(DeviceDisconnected(f"{what}; check power, cable and other programs that use it"))
         if self._application is not None:
             self._look_at(self._application, elapsed_s)
         self._make_safe()

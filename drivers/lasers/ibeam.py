@@ -273,7 +273,12 @@ class IbeamLaser(SerialLaser):
 
     def _do_disarm(self) -> None:
         self._armed = False
-        self._switch_off()
+        try:
+            self._switch_off()
+        except DeviceError:
+            with suppress(DeviceError):  # the first error is the one to report
+                self._set_level(_WORKING, 0.0)
+            raise
         self._set_level(_WORKING, 0.0)
 
     def _switch_off(self) -> None:
@@ -308,8 +313,14 @@ def _identify(config: IbeamConfig, framing: IbeamFraming, line: Dialogue) -> Ibe
         raise DeviceNotFound(f"{where}: {identity[:40]!r} ({version[:40]!r}) is no iBeam smart; correct 'port'")
     if config.serial_number != identity:
         require_serial_number("ibeam", config, identity.rpartition("-")[2])
-    _require_normal(where, line)
-    most_w = min(_most_w(line), config.max_power)
+    try:
+        _require_normal(where, line)
+        most_w = min(_most_w(line), config.max_power)
+    except DeviceError:
+        with suppress(DeviceError):  # the first error is the one to report
+            line.tell("laser off")
+            _log.warning("%s cannot be used and was told to switch off", where)
+        raise
     return IbeamLaser(line, framing, f"iBeam smart {identity}", LaserLimits(0.0, most_w))
 
 

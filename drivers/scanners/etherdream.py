@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from drivers.clock import Clock, SystemClock, now_s
-from drivers.errors import DeviceBusy, DeviceError, DeviceFault
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceNotFound
 from drivers.interfaces import ScannerStatus
 from drivers.registry import Kind, Surroundings, config_of, quantity
 from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSource
@@ -88,7 +88,7 @@ class EtherDreamDac:
         try:
             # Nothing broadcasts on a loopback interface; an emulated board must not cost the wait.
             heard = None if self._line.peer.startswith("127.") else listen(self._line.peer)
-            version = self._line.version() if heard is None or heard.software >= 2 else "unnamed"
+            version = self._version(heard) if heard is None or heard.software >= 2 else "unnamed"
             self._settle()
         except BaseException:
             self._line.close()
@@ -102,6 +102,17 @@ class EtherDreamDac:
             self.identity += f", MAC {heard.mac}, hardware {heard.hardware}, software {heard.software}"
             if heard.hardware not in _HARDWARE_KNOWN:
                 _log.warning("%s: the point clock of hardware %d is not known", self.name, heard.hardware)
+
+    def _version(self, heard: Any) -> str:
+        try:
+            return self._line.version()
+        except DeviceDisconnected as error:
+            if heard is not None:
+                raise
+            raise DeviceNotFound(
+                f"{self.name}: {self._line.peer} hangs up when asked for its version, as the oldest firmware does; let "
+                "its broadcasts through this computer's firewall (UDP port 7654)"
+            ) from error
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
         """The rate nearest to the requested one that the divider of the board's timer can make."""

@@ -21,6 +21,7 @@ opening brings a mirror that stands elsewhere to the centre along a ramp, and af
 Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
 """
 
+import logging
 import math
 import threading
 from collections.abc import Callable
@@ -33,7 +34,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from drivers.clock import Clock, SystemClock, now_s
-from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceFault, DeviceNotFound, LimitExceeded, ProtocolError
+from drivers.errors import (
+    DeviceBusy,
+    DeviceDisconnected,
+    DeviceError,
+    DeviceFault,
+    DeviceNotFound,
+    LimitExceeded,
+    ProtocolError,
+)
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
 from drivers.registry import Kind, Surroundings, config_of, quantity
 from drivers.scanners.dac_scanner import PATIENCE_S, DacScanner, PointSlice, PointSource
@@ -41,6 +50,8 @@ from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.scanners.nidaq_card import CALL_S, GRPC_PREFIX, NiCard
 from drivers.transports.endpoints import EMULATED_PREFIX, resolve
 from drivers.units import ExactHertz, Hertz, Seconds, Volts
+
+_log = logging.getLogger(__name__)
 
 _WRITE_S = 1.0
 _POLL_S = 0.01
@@ -51,6 +62,8 @@ _LEAST_QUEUED = 64
 _CENTRED = 0.005
 """Difference of a measured drive that counts as none: 50 mV of 10 V, more than any card's error."""
 _LINE = "port0/line"
+_NEVER = 2**30
+"""Edges before a pulse that is not to come."""
 _COUNTER_LEAD = 1
 """Points at rest before a waveform with counters: their first edge is 2 clocks after their start or later."""
 
@@ -97,6 +110,8 @@ class NidaqConfig(GalvoConfig):
 
     @model_validator(mode="after")
     def _check_wiring(self) -> Self:
+        if self.axis != "x":
+            raise ValueError(f"axis {self.axis} means nothing to an NI card; name the mirror's output by 'channel'")
         outputs = list(self.outputs.values())
         if len(set(outputs)) < len(outputs):
             raise ValueError(f"marker outputs {', '.join(outputs)} name one twice; give each its own, or null")
@@ -220,12 +235,27 @@ class NidaqDac:
         return drive
 
     def dark(self) -> None:
-        """Write all marker lines low."""
+        """Write all marker lines low, and let the counters idle, which is low: cleared ones keep their level."""
         if self.lines:
             with self.card.errors(), self.card.task() as task:
                 self.add_lines(task)
                 writer = self.card.writers.DigitalSingleChannelWriter(task.out_stream, auto_start=True)
                 writer.write_many_sample_port_uint32(np.zeros(1, np.uint32), _WRITE_S)
+        for name in self.config.counters.values():
+            with self.card.errors(), self.card.task() as task:
+                self.add_counter(task, name, _NEVER, 2, 2)
+                task.start()
+
+    def add_counter(self, task: Any, name: str, delay: int, low: int, high: int) -> None:
+        """Add a counter to a task: after so many edges of the mirror's clock, pulses of `high` edges, `low` between."""
+        task.co_channels.add_co_pulse_chan_ticks(
+            f"{self.card.device}/{name}",
+            self.card.terminal(self.config.counted_at or "ao/SampleClock"),
+            idle_state=self.card.const.Level.LOW,
+            initial_delay=delay,
+            low_ticks=low,
+            high_ticks=high,
+        )
 
     def add_mirror(self, task: Any) -> None:
         """Add the mirror's output to a task."""
@@ -298,7 +328,7 @@ class NidaqRun:
             with self._card.errors():
                 self._begin()
         except BaseException:
-            self._dac.release()
+            self._release_after_error()
             raise
 
     def feed(self, stopping: threading.Event) -> None:
@@ -306,8 +336,17 @@ class NidaqRun:
         try:
             with self._card.errors():
                 self._feed(stopping)
-        finally:
+        except BaseException:
+            self._release_after_error()
+            raise
+        self._dac.release()
+
+    def _release_after_error(self) -> None:
+        """End the tasks; the error that ended the run is the one to report."""
+        try:
             self._dac.release()
+        except DeviceError as error:
+            _log.error("%s: markers may be high: %s", self._dac.name, error)
 
     def _begin(self) -> None:
         dac, card, config = self._dac, self._card, self._dac.config
@@ -369,13 +408,8 @@ class NidaqRun:
         """A task that makes a marker by counting the mirror's sample clock."""
         card = self._card
         task = card.new_task()
-        task.co_channels.add_co_pulse_chan_ticks(
-            f"{card.device}/{name}",
-            card.terminal(self._dac.config.counted_at or "ao/SampleClock"),
-            initial_delay=_COUNTER_LEAD + first + 1,  # point i begins with clock i + 1
-            low_ticks=period - width,
-            high_ticks=width,
-        )
+        # Point i begins with clock i + 1.
+        self._dac.add_counter(task, name, _COUNTER_LEAD + first + 1, period - width, width)
         if (pulses := number * self.source.repeats) > 1:
             task.timing.cfg_implicit_timing(card.const.AcquisitionType.FINITE, samps_per_chan=pulses)
         return task

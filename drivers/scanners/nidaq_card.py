@@ -127,12 +127,13 @@ class NiCard:
 
     def _clear(self, task: Any) -> None:
         try:
-            task.close()
+            if task._handle is not None:  # else an interrupt came right after it was closed
+                task.close()
         except self._ni.DaqError as error:
             if error.error_code != _NO_TASK:
                 raise
         finally:
-            if task._handle is None:  # else it was interrupted
+            if task._handle is None and task in self._tasks:  # else it was interrupted, or another thread was faster
                 self._tasks.remove(task)
 
     def terminal(self, name: str) -> str:

@@ -24,10 +24,11 @@ hardware trigger armed, and says that it plays nothing; and as None otherwise.
 """
 
 import logging
+import os
 import re
 import threading
+import weakref
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal
 
@@ -110,7 +111,9 @@ class PulseStreamerConfig(BoardConfig):
 class PulseStreamer(SyncBoard):
     """A Pulse Streamer 8/2. Opening it first takes all outputs low, whatever the box was doing, and resets it.
 
-    The box obeys everybody on its network: keep other programs away from it.
+    The box obeys everybody on its network: keep other programs away from it. A program of several sweeps is ended by
+    this computer. If that is forgotten, it is done when the object is deleted or Python ends; if the process is killed,
+    the box opens the gate at every scan marker until it is opened again.
     """
 
     def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings, call_s: float = CALL_S) -> None:
@@ -125,6 +128,8 @@ class PulseStreamer(SyncBoard):
         """Whether the box has confirmed that all is low and that no trigger can change it."""
         self._aborts = 0
         self._ended: Literal["stopped", "aborted"] = "stopped"
+        self._armed = threading.Event()
+        """Set from the first call of a run until all is low again."""
         self._lost = False
         try:
             self._rpc.call("constant", LOW)
@@ -134,6 +139,7 @@ class PulseStreamer(SyncBoard):
         self._lower()
         self._firmware = self._check_firmware()
         self._serial = str(self._rpc.call("getSerial"))
+        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._rpc, self._armed, os.getpid())
         self._rpc.call("selectClock", CLOCKS[config.clock])
         self._check_clock()
         self._check_timing()
@@ -198,6 +204,7 @@ class PulseStreamer(SyncBoard):
         try:
             with self._lock:
                 self._safe = False
+                self._armed.set()
                 step("constant", (0, sequence.rest, 0, 0))
                 step("setTrigger", start, MANUAL if once else AUTO)
                 self._require_no_abort(aborts)
@@ -239,6 +246,7 @@ class PulseStreamer(SyncBoard):
     def _do_close(self) -> None:
         if self._run is not None:
             self._run.over.set()
+        self._forgotten.detach()
 
     def _lower(self, ended: Literal["stopped", "aborted"] = "aborted") -> None:
         """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives up.
@@ -253,11 +261,8 @@ class PulseStreamer(SyncBoard):
                 self._run.over.set()
                 self._run, self._ended = None, ended
             self._safe = False
-            self._rpc.call("setTrigger", SOFTWARE, MANUAL)
-            self._rpc.call("constant", LOW)  # again: until now a trigger may have started what was armed
-            # In place of the program, which some firmware may keep: whatever call of an interrupted or failed `run` the
-            # box takes up only after this, it has nothing else to play. Last, as it would freeze a high gate.
-            self._rpc.call("stream", _DARK, 1, LOW)
+            _replace_program(self._rpc)
+            self._armed.clear()
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
@@ -285,13 +290,16 @@ class PulseStreamer(SyncBoard):
                 if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
                     self._check_trigger(RISING)
                     checked_s = asked_s
-            except DeviceError as error:
+            except Exception as error:
                 if not run.over.is_set():
-                    _log.error("%s: while a program runs: %s", self.name, error)
+                    advice = "the gate may open at every scan marker, turn the laser off by its key"
+                    _log.error("%s: while a program runs: %s; %s", self.name, error, advice)
                     self._lost = True
-                    with suppress(DeviceError):
+                while not run.over.is_set():  # the box goes on by itself, and the network may come back
+                    try:
                         self._lower()
-                return
+                    except DeviceError:
+                        run.over.wait(CHECK_S)
 
     def _check_trigger(self, wanted: int) -> None:
         found = self._rpc.call("getTriggerStart")
@@ -343,6 +351,28 @@ class PulseStreamer(SyncBoard):
                 f"{self.name}: a dark test of 248 ns {what}; check the clock at its input and 'clock', power-cycle "
                 f"it, or report it with firmware {self._firmware}"
             )
+
+
+def _replace_program(rpc: JsonRpc) -> None:
+    """Disarm the box, after which all outputs are low and stay so."""
+    rpc.call("setTrigger", SOFTWARE, MANUAL)
+    rpc.call("constant", LOW)  # again: until now a trigger may have started what was armed
+    # In place of the program, which some firmware may keep: whatever call of an interrupted or failed `run` the box
+    # takes up only after this, it has nothing else to play. Last, as it would freeze a high gate.
+    rpc.call("stream", _DARK, 1, LOW)
+
+
+def _forgotten(name: str, rpc: JsonRpc, armed: threading.Event, process: int) -> None:
+    """Take the outputs of a box low that goes on opening the gate although nobody closes it: Python ends, or its object
+    was deleted. process: that of the box; in one that was forked from it nothing is done."""
+    if os.getpid() != process or not armed.is_set():
+        return
+    try:
+        rpc.call("constant", LOW)
+        _replace_program(rpc)
+        _log.warning("%s: was left running; its outputs were taken low", name)
+    except DeviceError as error:
+        _log.error("%s: was left running and may open the gate, turn the laser off by its key (%s)", name, error)
 
 
 KIND = Kind(config=PulseStreamerConfig, create=PulseStreamer)

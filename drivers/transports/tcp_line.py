@@ -14,6 +14,7 @@ from drivers.errors import DeviceDisconnected, DeviceError, DeviceNotFound, Devi
 from drivers.transports.endpoints import one_line
 
 _FORBIDDEN = (errno.EACCES, errno.EPERM)
+_NEXT = "check cable and power, end its other clients, then open it again"
 _CHUNK_BYTES = 65_536
 """Largest number of bytes that `receive` takes at a time."""
 _CONNECT_S = 5.0
@@ -78,7 +79,7 @@ class TcpStream:
                     raise  # of the connection: the other side is lost
                 return 0
         if n == 0:
-            raise DeviceDisconnected(f"{self._name}: {self._address} closed the connection")
+            raise DeviceDisconnected(f"{self._name}: {self._address} closed the connection; {_NEXT}")
         return n
 
     def receive_exactly(self, n: int, deadline_s: float) -> bytes:
@@ -124,7 +125,7 @@ class TcpStream:
             yield
         except OSError as error:
             raise DeviceDisconnected(
-                f"{self._name}: the connection to {self._address} is lost ({one_line(error)})"
+                f"{self._name}: the connection to {self._address} is lost ({one_line(error)}); {_NEXT}"
             ) from None
 
 

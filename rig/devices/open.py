@@ -90,7 +90,7 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
     with ExitStack() as stack:
         surroundings = surroundings_of(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
-        for slot in GUARDED:
+        for slot in reversed(GUARDED):  # the gate first: some lasers take seconds to open
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
             except Exception as error:  # no error of one device may keep the other one on
@@ -140,6 +140,8 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
                 devices.append(f"{slot}: {error}")
     if "laser" in opened:
         devices += _pause_if_emitting(opened["laser"])
+        if opened["laser"].gate_only and "sync" not in opened:
+            devices.append(f"laser: only that gate ends the light of {opened['laser'].name}: switch it off by hand")
     if usage:
         raise UsageError(*usage, *devices)
     if devices:

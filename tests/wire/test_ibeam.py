@@ -334,3 +334,11 @@ def test_one_that_was_power_cycled_hears_off_but_must_be_opened_again() -> None:
             again.arm(0.05)
             assert model.closed_gate_power_w == 0 < model.power_w
             assert model.powers_w[BIAS] == 0
+
+
+def test_a_laser_that_shines_and_cannot_be_used_is_told_to_switch_off() -> None:
+    model = IbeamModel(pulse_board=False)
+    model.shine(0.02, gated=False)
+    with wire(model) as (_, surroundings), pytest.raises(DeviceFault, match="no pulse board"):
+        open_ibeam(surroundings)
+    assert model.closed_gate_power_w == 0

@@ -17,11 +17,11 @@ from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, Devic
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.registry import lookup
 from drivers.scanners import nidaq, nidaq_card
-from drivers.scanners.nidaq import Nidaq, NidaqConfig, pulse_train
+from drivers.scanners.nidaq import Nidaq, NidaqConfig, NidaqDac, NidaqRun, pulse_train
 from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from tests.wire.lasers import eventually
 from tests.wire.ni_bench import NiBench, marked, ni_bench
-from tests.wire.scanners import cosine, finish
+from tests.wire.scanners import GALVO, cosine, finish
 
 USUAL: dict[str, Any] = {"port": "Dev1", "max_velocity": "400 /s", "max_acceleration": "1e6 /s2"}
 STEP = 1 / 32767
@@ -366,3 +366,38 @@ def test_an_interrupt_at_any_line_leaves_the_markers_low_and_no_task(bench: NiBe
         assert bench.drive()[0] == 0, at
         assert not any(task.outputs for task in bench.model.tasks.values()), at
     assert at > 300
+
+
+def test_a_marker_from_a_counter_is_low_after_a_stop_and_a_close() -> None:
+    with ni_bench(markers={GREEN: "port0/line0", BLUE: "ctr0", INTENSITY: "port0/line2"}) as bench:
+        with bench.open(scan_marker="ctr0", line_marker=None, backward_marker=None) as device:
+            wave = cosine(device, 2500)
+            wave.markers[:] = 0
+            wave.markers[:2400] |= MARKER_SCAN
+            device.load(wave, 1000)
+            device.start()
+            eventually(lambda: bench.levels()[1] == 1)
+            device.stop()
+            assert bench.levels() == bench.levels(after_s=10.0) == [0, 0, 0]
+        assert bench.levels(after_s=60.0) == [0, 0, 0]
+
+
+def test_the_first_error_of_a_run_is_told_although_its_end_fails_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def taken(dac: NidaqDac) -> None:
+        raise DeviceBusy("taken")
+
+    def interrupted(run: NidaqRun, stopping: Any) -> None:
+        raise KeyboardInterrupt
+
+    with ni_bench() as bench, bench.open() as device:
+        with monkeypatch.context() as patched:
+            patched.setattr(NidaqDac, "dark", taken)
+            patched.setattr(NidaqRun, "_feed", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                device.park()
+        device.park()
+
+
+def test_an_axis_is_refused_since_the_channel_is_the_mirror() -> None:
+    with pytest.raises(ValidationError, match="axis y means nothing"):
+        NidaqConfig.model_validate({"port": "Dev1", **GALVO, "axis": "y"})

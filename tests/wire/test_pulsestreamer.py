@@ -467,3 +467,29 @@ def test_the_box_is_asked_often_only_when_something_is_due() -> None:
     for asked_s, pause_s in ((11.0, POLL_S), (13.0, IDLE_POLL_S)):  # the next one may begin at any time
         count.take(asked_s, asked_s + 0.1, False)
         assert count.pause_s(asked_s + 0.1) == pause_s
+
+
+def test_a_box_that_was_out_of_reach_is_taken_low_when_the_network_is_back() -> None:
+    with pulse_box() as box, box.open() as device:
+        device.program(SWEEP, 3)
+        device.run()
+        box.server.unplug()
+        eventually(lambda: device.port_lost)
+        box.server.plug()
+        eventually(lambda: not device._armed.is_set())
+        box.trigger.pulse(box.now_s + 1e-3, 1e-3)
+        box.clock.sleep(2e-3)
+        assert box.pins == 0
+
+
+def test_a_box_that_is_forgotten_is_taken_low(caplog: pytest.LogCaptureFixture) -> None:
+    with pulse_box() as box:
+        device = box.open()
+        device.program(SWEEP, 3)
+        device.run()
+        device._forgotten()  # as when Python ends
+        assert "was left running; its outputs were taken low" in caplog.text
+        box.trigger.pulse(box.now_s + 1e-3, 1e-3)
+        box.clock.sleep(2e-3)
+        assert box.pins == 0
+        device.close()

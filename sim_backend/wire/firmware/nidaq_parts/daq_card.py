@@ -169,6 +169,8 @@ class Card:
         task.before, task.state = before, ni.RUNNING
         task.error, task.played, task.edges = None, 0, None
         task.done = not task.buffered and task.kind != "co"
+        if task.kind == "co":
+            self.outputs[task.outputs[0]].put(0.0, now_s)  # idle
         task.waiting = bool(task.trigger)
         if not task.waiting:
             self._triggered(task, now_s)
