@@ -189,7 +189,7 @@ class ScanBench:
 
 @contextmanager
 def scan_bench(
-    applications: Applications, laser: str, silence: str = "1.5 s", scanner: str = "helios"
+    applications: Applications, laser: str, silence: str = "1.5 s", scanner: str = "helios", sync: str = "prawndo"
 ) -> Iterator[ScanBench]:
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
@@ -203,6 +203,7 @@ def scan_bench(
                 "laser": laser,
                 "ttl_power": POWER,
                 "scanner": scanner,
+                "sync": sync,
                 "command_grid": {"first": -0.8, "last": 0.8, "columns": COLUMNS},
             }
         )
@@ -212,7 +213,7 @@ def scan_bench(
             elif laser == "obis":
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
-            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence, scanner)))
+            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence, scanner, sync)))
             bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
             try:
                 yield bench
@@ -234,7 +235,7 @@ def _end(bench: ScanBench) -> None:
     bench.applications.exit_code(bench.number, 5.0)
 
 
-def _config(laser: str, ports: dict[str, str], silence: str, scanner: str) -> dict[str, Any]:
+def _config(laser: str, ports: dict[str, str], silence: str, scanner: str, sync: str) -> dict[str, Any]:
     """The config of a rig with real ports; its world is outside of it."""
     content = emulated(**ports)
     del content["world"]
@@ -250,7 +251,7 @@ def _config(laser: str, ports: dict[str, str], silence: str, scanner: str) -> di
         del content["scanner"]["frame"]
         card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
         content["scanner"] |= card
-    content["laser"]["kind"] = laser
+    content["laser"]["kind"], content["sync"]["kind"] = laser, sync
     if laser == "ttl":
         content["laser"] = {"kind": laser, "power": POWER, "max_power": "50 mW"}  # a real one has no port
     content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": POWER}

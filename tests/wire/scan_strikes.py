@@ -41,8 +41,8 @@ _END_S = 60.0
 class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
     living, says what happened and ends with code 3. silence: of the SPAD that the guard lets pass; long, since
-    an emulated one may itself be late. scanner: its kind. labours: threads fight the scan's for the interpreter.
-    light_s, emission_s: until they are gone, at most."""
+    an emulated one may itself be late. scanner, sync: their kinds. labours: threads fight the scan's for the
+    interpreter. light_s, emission_s: until they are gone, at most."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
@@ -54,7 +54,7 @@ class ScanStrike:
     labours: bool = False
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
-    scanner: str = "helios"
+    sync: str = "prawndo"
 
 
 def _signal(number: int) -> Callable[[ScanBench], None]:
@@ -163,6 +163,9 @@ SCAN_STRIKES = {
     ),
     "interlock opened": ScanStrike(_open_interlock, own_end=True),
     "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
+    "killed, teensy": ScanStrike(_signal(signal.SIGKILL), sync="teensy"),
+    "teensy hangs": ScanStrike(_hang_gate, sync="teensy", light_s=NEVER_S),
+    "teensy unplugged": ScanStrike(_unplug_gate, own_end=True, sync="teensy"),
     # An NI card's scan marker stays as it was.
     "killed, ni card": ScanStrike(_signal(signal.SIGKILL), scanner="nidaq"),
     "ni card's server gone": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="nidaq"),
@@ -198,7 +201,7 @@ def strike_scan(
     waited for.
     """
     made = SCAN_STRIKES[name]
-    with scan_bench(applications, laser, made.silence, made.scanner) as bench:
+    with scan_bench(applications, laser, made.silence, made.scanner, made.sync) as bench:
         bench.start(maps=MAPS if measured else LONG_MAPS, record=made.record, labours=made.labours)
         opening_s = OPENING_S[laser] if made.at_once else 0.0
         into_s = share * (opening_s + LONG_S)
