@@ -62,7 +62,7 @@ campaign:  ## the five below: what is tried at random (many hours)
 
 SEQUENCES ?= 10000
 campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers; hardware in the loop
-	for driver in cobolt obis prawndo helios lasercube spb-usb spad512s blanking; do \
+	for driver in cobolt obis ibeam prawndo pulsestreamer teensy helios lasercube etherdream nidaq spb-usb spad512s blanking; do \
 		$(BIN)/python -m tests.campaigns.devices.faults $${driver} --sequences $(SEQUENCES) || exit; \
 	done
 	$(BIN)/python -m tests.campaigns.devices.hil_swaps
