@@ -349,8 +349,8 @@ class Strike:
 
 def test_an_interrupt_at_any_line_leaves_the_markers_low_and_no_task(bench: NiBench) -> None:
     at, struck = 0, True
-    while struck:  # at every 37th line, until there is none
-        at += 37
+    while struck:  # at every 101st line, until there is none
+        at += 101
         strike, before = Strike(at), sys.gettrace()
         with suppress(KeyboardInterrupt), bench.open() as device:
             device.load(marked(device, 700), 10_000)
