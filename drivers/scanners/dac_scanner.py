@@ -163,6 +163,10 @@ class DacRun(Protocol):
     def feed(self, stopping: threading.Event) -> None:
         """Send the other points; returns when the mirror rests. Brakes once `stopping` is set."""
 
+    def give_up(self) -> None:
+        """Make safe what `feed` has left, once its error is told. Raises no DeviceError."""
+        return
+
 
 class Dac(Protocol):
     """An open board, whose mirror stands at the centre, drive 0. Closing it puts the mirror back there in one jump."""
@@ -299,7 +303,11 @@ class DacScanner(BeamScanner):
         run = self._dac.run(PointSource(self._rest(), command, self._limits, float(clock_hz)), clock_hz)
         if run.source.left:
             self._begin(run)
-            run.feed(self._stopping)
+            try:
+                run.feed(self._stopping)
+            except BaseException:
+                run.give_up()
+                raise
             self._position = run.source.last
 
     def _begin(self, run: DacRun) -> None:
@@ -315,6 +323,7 @@ class DacScanner(BeamScanner):
         except Exception as error:  # a driver's own fault too must end a scan: its frames have no markers any more
             self._error = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
             _log.error("%s", error)
+            run.give_up()
 
     def _rest(self) -> float:
         """Wait for a run to end; returns the drive at which the mirror rests. If that is unknown, halts the board."""

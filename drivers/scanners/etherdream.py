@@ -25,7 +25,7 @@ from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceNotFound
 from drivers.interfaces import ScannerStatus
 from drivers.registry import Kind, Surroundings, config_of, quantity
-from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacScanner, PointSource
+from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacRun, DacScanner, PointSource
 from drivers.scanners.etherdream_line import (
     CLEAR,
     EMERGENCY,
@@ -210,7 +210,7 @@ class EtherDreamDac:
             )
 
 
-class EtherDreamRun:
+class EtherDreamRun(DacRun):
     """One run: `begin`, then `feed`. No wait is longer than the queued points take plus two seconds."""
 
     def __init__(self, dac: EtherDreamDac, source: PointSource, clock_hz: Fraction) -> None:

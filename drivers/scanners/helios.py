@@ -47,6 +47,7 @@ from drivers.scanners.dac_scanner import (
     DRIFT,
     PATIENCE_S,
     POLL_S,
+    DacRun,
     DacScanner,
     PointSlice,
     PointSource,
@@ -276,7 +277,7 @@ _WIRE_BYTES_PER_S = 1.216e6
 """Bytes a second that a full-speed bulk endpoint carries: 19 packets of 64 bytes a millisecond (USB 2.0, table 5-9)."""
 
 
-class HeliosRun:
+class HeliosRun(DacRun):
     """One run: `begin`, then `feed`. No wait is longer than two frames plus two seconds."""
 
     def __init__(self, link: HeliosDac, source: PointSource, clock_hz: Fraction) -> None:

@@ -44,6 +44,7 @@ from drivers.scanners.dac_scanner import (
     FULL_SCALE,
     PATIENCE_S,
     POLL_S,
+    DacRun,
     DacScanner,
     PointSlice,
     PointSource,
@@ -220,7 +221,7 @@ _TOLERANCE_POINTS = 48
 counting."""
 
 
-class LaserCubeRun:
+class LaserCubeRun(DacRun):
     """One run: `begin`, then `feed`. No wait is longer than the queued samples take plus one second."""
 
     def __init__(self, link: LaserCubeDac, source: PointSource, rate_hz: int) -> None:

@@ -45,7 +45,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
 from drivers.registry import Kind, Surroundings, config_of, quantity
-from drivers.scanners.dac_scanner import PATIENCE_S, DacScanner, PointSlice, PointSource
+from drivers.scanners.dac_scanner import PATIENCE_S, DacRun, DacScanner, PointSlice, PointSource
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.scanners.nidaq_card import CALL_S, GRPC_PREFIX, NiCard
 from drivers.transports.endpoints import EMULATED_PREFIX, resolve
@@ -62,6 +62,8 @@ _LEAST_QUEUED = 64
 _CENTRED = 0.005
 """Difference of a measured drive that counts as none: 50 mV of 10 V, more than any card's error."""
 _LINE = "port0/line"
+_PATIENT = 0.6
+"""Share of the buffer that a call may take while a waveform is played."""
 _NEVER = 2**30
 """Edges before a pulse that is not to come."""
 _COUNTER_LEAD = 1
@@ -305,7 +307,7 @@ def pulse_train(high: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
     return int(begins[0]), int(widths[0]), int(periods[0]), len(begins)
 
 
-class NidaqRun:
+class NidaqRun(DacRun):
     """One run: `begin`, then `feed`. No wait is longer than `start_wait` plus one second."""
 
     def __init__(self, dac: NidaqDac, source: PointSource, clock_hz: Fraction) -> None:
@@ -328,20 +330,17 @@ class NidaqRun:
             with self._card.errors():
                 self._begin()
         except BaseException:
-            self._release_after_error()
+            self.give_up()
             raise
 
     def feed(self, stopping: threading.Event) -> None:
         """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
-        try:
-            with self._card.errors():
-                self._feed(stopping)
-        except BaseException:
-            self._release_after_error()
-            raise
+        # A call that is later than this leaves too little time to take the gate low before the points run dry.
+        with self._card.errors(), self._card.patient(_PATIENT * self._dac.config.buffer):
+            self._feed(stopping)
         self._dac.release()
 
-    def _release_after_error(self) -> None:
+    def give_up(self) -> None:
         """End the tasks; the error that ended the run is the one to report."""
         try:
             self._dac.release()

@@ -77,7 +77,8 @@ class NiCard:
         self._ni, self.const, self.writers, system, errors = map(_import, modules)
         self._error: type[Exception] = errors.Error
         self._tasks: list[Any] = []
-        self._channel = _connect(server) if server else None
+        self._limit_s = CALL_S
+        self._channel = _connect(server, lambda: self._limit_s) if server else None
         self._options = self._ni.GrpcSessionOptions(self._channel, "") if self._channel else None
         try:
             with self.errors():
@@ -86,6 +87,15 @@ class NiCard:
         except BaseException:
             self.disconnect()
             raise
+
+    @contextmanager
+    def patient(self, limit_s: float) -> Iterator[None]:
+        """Within this context a call to a server may take so long, and no longer."""
+        self._limit_s = min(limit_s, CALL_S)
+        try:
+            yield
+        finally:
+            self._limit_s = CALL_S
 
     def disconnect(self) -> None:
         """Close the channel to the server, if there is one. Leaves the card as it is."""
@@ -188,7 +198,7 @@ class NiCard:
         if status == "UNAVAILABLE":
             return DeviceDisconnected(f"{self.name}: gRPC server lost, while the card keeps its levels; check both")
         if status == "DEADLINE_EXCEEDED":
-            return DeviceTimeout(f"{self.name}: no answer of the gRPC server within {CALL_S:g} s; check the network")
+            return DeviceTimeout(f"{self.name}: no answer of the gRPC server in time; check the network")
         return ProtocolError(f"{self.name}: gRPC {status}: {text}; check NI's gRPC device server")
 
 
@@ -200,14 +210,14 @@ def _import(module: str) -> Any:
         raise ProtocolError(f"nidaq: no package {error.name}; install the extra spadrig[nidaq]: {command}") from error
 
 
-def _connect(server: str) -> Any:
+def _connect(server: str, limit_s: Callable[[], float]) -> Any:
     grpc = _import("grpc")
 
     class Deadline(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc, name-defined]
         late = False
 
         def intercept_unary_unary(self, go_on: Any, details: Any, request: Any) -> Any:
-            limited = details._replace(timeout=_LATE_S if self.late else CALL_S)
+            limited = details._replace(timeout=min(limit_s(), _LATE_S if self.late else CALL_S))
             call = _aside(lambda: go_on(limited, request), CALL_S + 1)
             self.late = call.code() is grpc.StatusCode.DEADLINE_EXCEEDED
             return call

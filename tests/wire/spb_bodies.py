@@ -49,10 +49,11 @@ def queued_reads_bring_every_frame_where_libusb_wrote_it_and_plain_ones_too() ->
 def stopping_with_reads_in_flight_leaves_the_device_ready() -> None:
     with opened("queued") as device:
         for _ in range(3):
-            ring, _ = begin(device, REQUEST, None, 40)
+            ring, reader = begin(device, REQUEST, None, 40)
             for _ in range(5):
                 device.fill(ring, PATIENCE_S)
             device.stop()
+            reader.close()
             assert len(ring._free) == ring.slots
         assert require_right(take(device, 100)) == list(range(100))
 
