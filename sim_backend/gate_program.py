@@ -1,5 +1,7 @@
 """The simulated pattern generator's outputs over time: a program of words that the scan marker triggers."""
 
+import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -10,6 +12,29 @@ from drivers.interfaces import OUT_GATE, Pulse, sliced
 Array = NDArray[np.float64]
 Trigger = Callable[[float, float], float | None]
 """The first time in [from, until) at which the scan marker is high; None: it stays low."""
+
+
+class OutputLevels:
+    """Levels of a board's outputs over time: low at first, then what `_times` and `_levels` say."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = [-math.inf]
+        self._levels: list[int] = [0]
+
+    def outputs_at(self, at_s: float) -> int:
+        """Levels of the outputs at a time to which the model has been advanced."""
+        return self._levels[bisect_right(self._times, at_s) - 1]
+
+    def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
+        """The level at `from_s`, then each change up to and including `until_s`: (time, outputs)."""
+        first = bisect_right(self._times, from_s)
+        last = bisect_right(self._times, until_s)
+        return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
+
+    def forget(self, before_s: float) -> None:
+        """Drop the level changes that are needed only for times before `before_s`."""
+        keep = max(0, bisect_right(self._times, before_s) - 1)
+        del self._times[:keep], self._levels[:keep]
 
 
 class GateProgram:

@@ -164,7 +164,8 @@ class DacRun(Protocol):
         """Send the other points; returns when the mirror rests. Brakes once `stopping` is set."""
 
     def give_up(self) -> None:
-        """Make safe what `feed` has left, once its error is told. Raises no DeviceError."""
+        """Make safe what `begin` or `feed` has left. For a run of a thread its error is told first. Raises no
+        DeviceError."""
         return
 
 
@@ -313,7 +314,11 @@ class DacScanner(BeamScanner):
     def _begin(self, run: DacRun) -> None:
         self._stopping.clear()
         self._position = None
-        run.begin()
+        try:
+            run.begin()
+        except BaseException:
+            run.give_up()
+            raise
 
     def _feed(self, run: DacRun) -> None:
         """Feed the device, in the thread. An error ends the run, and `status` reports it."""

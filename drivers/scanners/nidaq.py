@@ -326,12 +326,8 @@ class NidaqRun(DacRun):
 
     def begin(self) -> None:
         """Make the tasks, fill their buffers and start them, the mirror's last."""
-        try:
-            with self._card.errors():
-                self._begin()
-        except BaseException:
-            self.give_up()
-            raise
+        with self._card.errors():
+            self._begin()
 
     def feed(self, stopping: threading.Event) -> None:
         """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""

@@ -7,12 +7,13 @@ answers cut after 127 characters, and an external clock that is not checked and 
 """
 
 import re
-from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+
+from sim_backend.gate_program import OutputLevels
 
 STOPPED, STARTING, RUNNING, ABORT_REQUESTED, ABORTED = 0, 1, 2, 3, 5
 """Values of `run-status` that a host can see."""
@@ -51,7 +52,7 @@ class _Run:
     since_s: float
 
 
-class PrawnDoModel:
+class PrawnDoModel(OutputLevels):
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
     trigger: the signal on GPIO16; None: always low. board: 1 for a Pico, 2 for a Pico 2. version: what `ver` answers.
@@ -78,8 +79,7 @@ class PrawnDoModel:
         self.late_abort = False
         """Test knob: whether `abt` comes in the instant in which the program ends. Nobody then answers the request."""
         self._now_s = float("-inf")  # the latest time at which the wire was served
-        self._times: list[float] = [float("-inf")]
-        self._levels: list[int] = [0]
+        super().__init__()
         self._restart()
 
     def _restart(self) -> None:
@@ -148,23 +148,6 @@ class PrawnDoModel:
         self._settle(now_s)
         unasked, self._unasked = self._unasked, b""
         return unasked
-
-    # The pins
-
-    def outputs_at(self, at_s: float) -> int:
-        """Levels of the sixteen outputs at a time to which the model has been advanced."""
-        return self._levels[bisect_right(self._times, at_s) - 1]
-
-    def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
-        """The level at `from_s`, then each change up to and including `until_s`: (time, outputs)."""
-        first = bisect_right(self._times, from_s)
-        last = bisect_right(self._times, until_s)
-        return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
-
-    def forget(self, before_s: float) -> None:
-        """Drop the level changes that are needed only for times before `before_s`."""
-        keep = bisect_right(self._times, before_s) - 1
-        del self._times[:keep], self._levels[:keep]
 
     # What happens to the device
 

@@ -8,10 +8,11 @@ no DTR, so that only `close_port` lets it fall. The board drops replies that nob
 
 import re
 import zlib
-from bisect import bisect_right
 from collections.abc import Callable
 from math import inf
 from typing import Final, Literal
+
+from sim_backend.gate_program import OutputLevels
 
 TICK_S = 10e-9
 MAX_WORDS = 30_000
@@ -35,7 +36,7 @@ Marker = Callable[[float, float], float | None]
 """The first time in [from, until) at which the scan marker is high, or low; None: there is none."""
 
 
-class TeensyModel:
+class TeensyModel(OutputLevels):
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
     trigger, marker_low: when the scan marker is high, and when it is low. Without trigger it is always low; without
@@ -52,8 +53,7 @@ class TeensyModel:
         """Whether a host has the port open."""
         self.more_status = ""
         """Test knob: text that a later version of the firmware appends to a status."""
-        self._times: list[float] = [-inf]
-        self._levels: list[int] = [0]
+        super().__init__()
         self._shorted = 0
         self._restart()
 
@@ -95,23 +95,6 @@ class TeensyModel:
         """Play on to `now_s`. Nothing is ever sent unasked."""
         self.advance(now_s)
         return b""
-
-    # The pins
-
-    def outputs_at(self, at_s: float) -> int:
-        """Levels of the three outputs, 0 to 7, at a time to which the model has been advanced."""
-        return self._levels[bisect_right(self._times, at_s) - 1]
-
-    def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
-        """The level at `from_s`, then each change up to and including `until_s`: (time, outputs)."""
-        first = bisect_right(self._times, from_s)
-        last = bisect_right(self._times, until_s)
-        return [(from_s, self._levels[first - 1]), *zip(self._times[first:last], self._levels[first:last], strict=True)]
-
-    def forget(self, before_s: float) -> None:
-        """Drop the level changes that are needed only for times before `before_s`."""
-        keep = max(0, bisect_right(self._times, before_s) - 1)
-        del self._times[:keep], self._levels[:keep]
 
     # What happens to the device
 

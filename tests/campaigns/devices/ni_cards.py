@@ -25,7 +25,7 @@ from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from sim_backend.wire.firmware.nidaq import NidaqModel
 from sim_backend.wire.serve.grpc import GrpcServer
 from tests.campaigns.devices import scanners
-from tests.campaigns.outcomes import Ending, ending
+from tests.campaigns.outcomes import Ending
 from tests.wire.faults import Fault, FaultSchedule
 from tests.wire.scanners import GALVO
 
@@ -183,20 +183,12 @@ def sequence(seed: int) -> Ending:
             require_rest(model, now_s(clock), {Fault.LOST, Fault.STALL}.isdisjoint(schedule.struck))
         return end
 
-    foreign: list[str] = []
-    before = threading.excepthook
-    threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
-    try:
-        with (
-            patch("grpc.insecure_channel", lambda *_, **__: channel),
-            patch("grpc.channel_ready_future", lambda _: _Ready()),
-            patch("nidaqmx._stubs.nidaqmx_pb2_grpc.NiDAQmxStub", lru_cache(1)(NiDAQmxStub)),  # costs 10 ms a task
-        ):
-            ended = ending(act, lambda: now_s(clock), DEADLINE_S)
-    finally:
-        threading.excepthook = before
-    struck = [fault.value for fault in schedule.struck]
-    return ended._replace(wrong=foreign[0] if foreign else ended.wrong, struck=struck)
+    with (
+        patch("grpc.insecure_channel", lambda *_, **__: channel),
+        patch("grpc.channel_ready_future", lambda _: _Ready()),
+        patch("nidaqmx._stubs.nidaqmx_pb2_grpc.NiDAQmxStub", lru_cache(1)(NiDAQmxStub)),  # costs 10 ms a task
+    ):
+        return scanners.ending_of(act, schedule, lambda: now_s(clock), DEADLINE_S)
 
 
 def lit_wave(device: BeamScanner) -> ScanWaveform:

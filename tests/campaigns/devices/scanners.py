@@ -85,15 +85,18 @@ def sequence(subject: Subject, seed: int) -> Ending:
         with open_scanner(subject.kind, plugged.bus, plugged.clock, **subject.config) as device:
             return judged(subject, rng, device, wave(device), plugged.now_s, model.history)
 
-    return _ending(act, schedule, plugged.now_s)
+    return ending_of(act, schedule, plugged.now_s)
 
 
-def _ending(act: Callable[[], str], schedule: FaultSchedule, now_s: Callable[[], float]) -> Ending:
+def ending_of(
+    act: Callable[[], str], schedule: FaultSchedule, now_s: Callable[[], float], deadline_s: float = DEADLINE_S
+) -> Ending:
+    """How an act ended; an error in any thread is a wrong end."""
     foreign: list[str] = []
     before = threading.excepthook
     threading.excepthook = lambda what: foreign.append(f"in a thread: {what.exc_type.__name__}: {what.exc_value}")
     try:
-        ended = ending(act, now_s, DEADLINE_S)
+        ended = ending(act, now_s, deadline_s)
     finally:
         threading.excepthook = before
     struck = [fault.value for fault in schedule.struck]
@@ -133,7 +136,7 @@ def etherdream_sequence(seed: int) -> Ending:
                 at = np.array([wire.now_s])
                 assert model.history.command(at)[0] == helios.CENTRE, "the mirror is not at the centre"
 
-        return _ending(act, schedule, lambda: wire.now_s)
+        return ending_of(act, schedule, lambda: wire.now_s)
 
 
 EVENTS: dict[str, Callable[[EtherDreamModel, float], None]] = {
