@@ -13,7 +13,6 @@ import numpy as np
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.optional_packages import install_command
-from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.nidaq import Call
 from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError
 from sim_backend.wire.serve.tcp import HOST
@@ -62,11 +61,6 @@ class GrpcServer(WireServer[GrpcModel]):
     def address(self) -> str:
         """Address at which a client finds the server."""
         return f"{HOST}:{self._port}"
-
-    @property
-    def endpoint(self) -> Endpoint:
-        """The endpoint of that address for `Surroundings.ports`."""
-        return Endpoint(self.address)
 
     def plug(self) -> None:
         """Listen, on the same port as before."""

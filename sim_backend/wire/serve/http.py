@@ -16,7 +16,6 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, Protocol
 
 from drivers.clock import Clock
-from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.serve.wire_server import WireServer
 
 CHUNK_BYTES = 65_536
@@ -59,11 +58,6 @@ class HttpServer(WireServer[RpcModel]):
     def address(self) -> str:
         """Address of the calls, HOST:PORT. A client that knows the port itself is given HOST alone."""
         return f"{self._host}:{self.model.http_port}"
-
-    @property
-    def endpoint(self) -> Endpoint:
-        """The endpoint of that address for `Surroundings.ports`."""
-        return Endpoint(self.address)
 
     def plug(self) -> None:
         """Plug the cable in, at the same address as before. Raises OSError if the address is in use."""

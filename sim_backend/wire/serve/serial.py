@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Protocol
 
 from drivers.clock import Clock
-from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.serve.wire_server import WireServer
 
 BITS_PER_CHARACTER = 10
@@ -52,9 +51,9 @@ class SerialServer(WireServer[SerialModel]):
         return str(Path(self._folder.name) / "tty")
 
     @property
-    def endpoint(self) -> Endpoint:
-        """The endpoint of that path for `Surroundings.ports`."""
-        return Endpoint(self.path)
+    def address(self) -> str:
+        """The same path."""
+        return self.path
 
     def close(self) -> None:
         """Unplug the device for good; a second call does nothing."""

@@ -9,7 +9,6 @@ from contextlib import suppress
 from typing import Protocol
 
 from drivers.clock import Clock
-from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.serve.wire_server import WireServer
 
 HOST = "127.0.0.1"
@@ -51,11 +50,6 @@ class TcpServer(WireServer[TcpModel]):
     def address(self) -> str:
         """Address at which a client finds the device."""
         return f"{HOST}:{self._port}"
-
-    @property
-    def endpoint(self) -> Endpoint:
-        """The endpoint of that address for `Surroundings.ports`."""
-        return Endpoint(self.address)
 
     def plug(self) -> None:
         """Start the program, which listens on the same port as before."""

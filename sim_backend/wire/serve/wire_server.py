@@ -33,8 +33,13 @@ class WireServer(ABC, Generic[Model]):
 
     @property
     @abstractmethod
+    def address(self) -> str:
+        """Address at which a host finds the device while it is plugged in."""
+
+    @property
     def endpoint(self) -> Endpoint:
-        """The endpoint at which a host finds the device while it is plugged in, for `Surroundings.ports`."""
+        """The endpoint of that address, for `Surroundings.ports`."""
+        return Endpoint(self.address)
 
     def start(self) -> Self:
         """Plug the device in and serve it."""
