@@ -31,8 +31,8 @@ from drivers.guard.owned import Owned, make_safe
 from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
-from drivers.transports.endpoints import Endpoint, resolve
-from drivers.transports.serial_port import BAUD, SerialPort
+from drivers.transports.endpoints import Endpoint
+from drivers.transports.serial_port import OFF_TIMES, SerialPort, configured_port
 
 _log = logging.getLogger(__name__)
 
@@ -345,8 +345,6 @@ def main(arguments: list[str]) -> int:
 FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
-OFF_TIMES = 2
-"""Number of times that `Kind.off` is sent: the laser may ignore the first, since the guard may just have asked it."""
 
 
 class Rescue:
@@ -361,7 +359,7 @@ class Rescue:
             kind = lookup(slot, config.kind)
             self._create[slot] = partial(kind.create, config, surroundings)
             if kind.off is not None:
-                self._off[slot] = partial(_open_port, slot, config, ports), kind.off(config)
+                self._off[slot] = partial(configured_port, slot, config, ports), kind.off(config)
         self._outcome: dict[str, str] = {}
 
     def run(self, slots: set[str], armed: bool) -> str:
@@ -393,11 +391,6 @@ class Rescue:
         open_port, off = self._off[slot]
         with closing(_once_free(open_port)) as port:
             port.write_again(off, OFF_TIMES)
-
-
-def _open_port(slot: str, config: Any, ports: Mapping[str, Endpoint]) -> SerialPort:
-    """The port of a config, at the config's rate if it has one: at another one the laser would not understand."""
-    return SerialPort(slot, resolve(config.port, ports), baud=getattr(config, "baud", BAUD))
 
 
 def _once_free(open_it: Callable[[], Any]) -> Any:

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from enum import Enum
 from typing import Self
 
-from drivers.errors import WrongState
+from drivers.errors import DeviceDisconnected, WrongState
 
 _log = logging.getLogger(__name__)
 
@@ -66,14 +66,18 @@ class Device(ABC):
         return self._state
 
     def close(self) -> None:
-        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and release it. A second call does
-        nothing.
+        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and release it.
+
+        A second call does nothing. If the device was unplugged, that is logged as an error, and nothing is raised:
+        there is nothing left to be done from here. Any other failure to leave it safe is raised.
         """
         if self._state is DeviceState.CLOSED:
             return
         _log.info("%s: close", self._name)
         try:
             self._make_safe()
+        except DeviceDisconnected as error:
+            _log.error("%s: closed, but it could not be left safe: %s", self._name, error)
         finally:
             self._state = DeviceState.CLOSED
             self._do_close()

@@ -28,7 +28,7 @@ from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming
 from drivers.transports.endpoints import resolve
-from drivers.transports.serial_port import BAUD, SerialPort
+from drivers.transports.serial_port import BAUD, OFF_TIMES, SerialPort
 from drivers.units import Watts
 
 
@@ -56,10 +56,6 @@ class _Light:
     may_shine = False
 
 
-_OFF_TIMES = 3
-"""Number of times that the bytes that switch off are sent: the first may come too soon after a reply to be heard."""
-
-
 def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: int) -> None:
     """End the light of a laser that may shine and is not watched any more. process: number of the laser's process; in
     another one, which was forked from it, nothing is done."""
@@ -67,7 +63,7 @@ def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: 
         return
     if light.may_shine:
         try:
-            port.write_again(off, _OFF_TIMES)
+            port.write_again(off, OFF_TIMES)
             _log.warning("%s: was left armed; it was told to switch off", name)
         except DeviceError as error:
             _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)

@@ -8,7 +8,7 @@ own clock. Network ports are refused, because those of pyserial 3.5 write withou
 import errno
 import os
 import select
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -25,7 +25,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.endpoints import UDEV_RULES, Endpoint, one_line
+from drivers.transports.endpoints import UDEV_RULES, Endpoint, one_line, resolve
 from drivers.transports.tap import IN, OUT, Tap
 
 try:
@@ -43,6 +43,9 @@ BAUD = 115_200
 AGAIN_S = 0.11
 """Time between the same bytes sent again: a Cobolt ignores a command within 0.1 s of its last answer
 (docs/reference/devices/cobolt.md)."""
+OFF_TIMES = 2
+"""Number of times that the bytes that switch a laser off are sent: it may ignore the first, since it may just have been
+asked something."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 
@@ -210,6 +213,11 @@ class SerialPort:
             raise DeviceDisconnected(
                 f"{self._name}: port {self.path} is lost ({one_line(error)}); plug it in again"
             ) from None
+
+
+def configured_port(name: str, config: Any, ports: Mapping[str, Endpoint]) -> SerialPort:
+    """Open the port of a device's config, at the config's rate if it names one. Errors as those of `SerialPort`."""
+    return SerialPort(name, resolve(config.port, ports), baud=getattr(config, "baud", BAUD))
 
 
 def _find(name: str, address: str) -> str:

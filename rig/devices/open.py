@@ -4,7 +4,7 @@ It also checks that the user consents to light: a real laser or gate needs that 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
+from drivers.transports.serial_port import OFF_TIMES, configured_port
 from drivers.transports.tap import Tap, TapFile
 from rig.config.models import RigConfig
 from rig.errors import DevicesError, UsageError
@@ -84,7 +85,8 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`.
+    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`. A laser
+    that cannot be opened is told to switch off all the same, if its kind has bytes for that: it may hear us.
 
     Raises DeviceError if the world, if there is one, cannot be made."""
     with ExitStack() as stack:
@@ -94,8 +96,20 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
             except Exception as error:  # no error of one device may keep the other one on
-                trouble.append(f"{slot}: {error}")
+                trouble.append(f"{slot}: {error}{_switched_off_unheard(slot, getattr(config, slot), surroundings)}")
         yield opened["sync"], opened["laser"]
+
+
+def _switched_off_unheard(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
+    kind = lookup(slot, config.kind)
+    if kind.off is None:
+        return ""
+    try:
+        with closing(configured_port(slot, config, surroundings.ports)) as port:
+            port.write_again(kind.off(config), OFF_TIMES)
+    except DeviceError:
+        return ""  # the first error says what is wrong with the port
+    return " (it was told to switch off all the same, but did not answer: look whether it is dark)"
 
 
 def check_files(config: RigConfig) -> None:

@@ -234,13 +234,13 @@ def strike_scan(
         )
 
 
-def lateness_of(name: str, outcome: ScanOutcome) -> list[str]:
+def lateness_of(name: str, laser: str, outcome: ScanOutcome) -> list[str]:
     """What came too late after one blow, but for the 100 ms, which are a percentile's."""
     made = SCAN_STRIKES[name]
     found = []
     if outcome.light_s > max(NEVER_S, made.light_s):
         found.append(f"light after {1e3 * outcome.light_s:.0f} ms")
-    if made.laser_answers and outcome.emission_s > made.emission_s:
+    if made.laser_answers and laser != BY_HAND and outcome.emission_s > made.emission_s:
         found.append(f"emission after {outcome.emission_s:.2f} s")
     return found
 

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from drivers.clock import now_s
+from drivers.clock import VirtualClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
-from drivers.guard.process import OFF_TIMES
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
 from drivers.lasers import ibeam as ibeam_framing
@@ -22,8 +21,10 @@ from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.registry import kinds, lookup
 from drivers.transports.dialogue import FairLock
-from drivers.transports.serial_port import AGAIN_S
+from drivers.transports.serial_port import AGAIN_S, OFF_TIMES
 from rig.config.files import load_config
+from rig.devices import open as session
+from rig.devices.doctor import laser_off
 from rig.devices.open import open_rig
 from rig.errors import DevicesError
 from sim_backend.wire.firmware.cobolt import CoboltModel
@@ -91,6 +92,32 @@ def test_the_bytes_that_switch_a_laser_off_darken_it_while_it_emits(name: str) -
         assert not model.emitting
 
 
+class Mute(Silent):
+    """A laser whose answers get lost."""
+
+    def __init__(self, laser: Any) -> None:
+        self.laser = laser
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        self.laser.receive(data, now_s)
+        return b""
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_a_laser_that_hears_but_does_not_answer_is_switched_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    make, model, clock = MAKES[name], MAKES[name].model(), VirtualClock()
+    config = load_config("simulated").model_copy(update={"laser": make.config.model_validate({"kind": name, **USUAL})})
+    with wire(model, clock=clock) as (_, surroundings):
+        bring_up(laser := make.open(surroundings), clock)
+        laser._line.port.close()  # type: ignore[attr-defined]
+    assert model.emitting
+    with wire(Mute(model), clock=clock) as (_, surroundings):
+        monkeypatch.setattr(session, "surroundings_of", lambda *_: surroundings)
+        with pytest.raises(DevicesError, match="told to switch off all the same"):
+            laser_off(config)
+    assert not model.emitting
+
+
 @each_make
 def test_another_laser_than_the_config_names_is_refused_and_a_busy_one_too(make: Make) -> None:
     with wire(make.model(serial="777")) as (_, surroundings):
@@ -122,7 +149,9 @@ def test_the_application_pauses_a_laser_found_emitting_and_refuses_the_scan() ->
 
 
 @each_dialect
-def test_trap_no_watchdog_so_a_lost_port_leaves_it_on_and_is_said_at_once(make: Make) -> None:
+def test_trap_no_watchdog_so_a_lost_port_leaves_it_on_and_is_said_at_once(
+    make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
     model = make.model()
     with wire(model) as (server, surroundings):
         laser = make.open(surroundings)
@@ -130,9 +159,12 @@ def test_trap_no_watchdog_so_a_lost_port_leaves_it_on_and_is_said_at_once(make: 
         server.unplug()
         assert model.emitting
         assert laser.port_lost  # type: ignore[attr-defined]
-        for verb in (laser.pause, laser.disarm, lambda: laser.status, laser.close):
+        for verb in (laser.pause, laser.disarm, lambda: laser.status):
             with pytest.raises(DeviceDisconnected, match="is lost"):
                 verb()
+        laser.close()
+        assert "could not be left safe" in caplog.text
+        assert "may shine, turn its key off" in caplog.text
         server.plug()
         with make.open(surroundings) as again:
             assert again.status.emission
