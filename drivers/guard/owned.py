@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, used through the application's messages, made safe at the end.
 
-Each device has two `Lane`s. A lane is a thread that does one job after the other.
+Each device has two lanes: threads (`JobThread`) that do one job after the other.
 """
 
 import itertools
@@ -23,7 +23,7 @@ from drivers.transports.tap import Tap, TapFile
 Job = Callable[[], object]
 
 
-class Lane:
+class JobThread:
     """A daemon thread that does jobs one after the other. An error in a job is only logged: the next job may be the one
     that switches the light off.
     """
@@ -70,8 +70,8 @@ class Owned:
         """Whether this is a laser that is to be disarmed if the application cannot go on."""
         self.emits = False
         """Whether this is a laser that shines through an open gate, judged by the calls made so far."""
-        self.lane = Lane(slot)
-        self.urgent = Lane(f"{slot}, urgent")
+        self.lane = JobThread(slot)
+        self.urgent = JobThread(f"{slot}, urgent")
         self.enabling = False
         """Whether a method that may switch light on is under way on `lane`."""
         self.unsafe = False

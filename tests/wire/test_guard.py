@@ -17,7 +17,7 @@ from drivers.errors import CommandRefused, DeviceBusy, DeviceError, DeviceNotFou
 from drivers.guard import Guard, GuardLimits
 from drivers.guard.channel import error_from, error_message
 from drivers.guard.client import ANSWER_S
-from drivers.guard.owned import Lane
+from drivers.guard.owned import JobThread
 from drivers.guard.process import Rescue
 from drivers.lasers.cobolt import CoboltConfig
 from drivers.lasers.obis import ObisConfig
@@ -178,7 +178,7 @@ def broken(*_: object) -> NoReturn:
 
 
 def test_a_driver_that_fails_in_its_own_way_keeps_no_other_device_alight(rig: GuardedRig) -> None:
-    lane, done = Lane("test"), threading.Event()
+    lane, done = JobThread("test"), threading.Event()
     lane.do(broken)
     lane.do(done.set)
     assert done.wait(PATIENCE_S)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from drivers.clock import VirtualClock, now_s
 from sim_backend.wire.firmware.helios import BLUE, GREEN
 from sim_backend.wire.firmware.nidaq import NidaqModel
-from sim_backend.wire.firmware.nidaq_parts.daq_outputs import Edges, Output, Span
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import Edges, Output, Samples
 from sim_backend.wire.serve.grpc import GrpcServer
 
 RATE_HZ = 50_000.0
@@ -307,7 +307,7 @@ def test_edges_are_where_the_level_changes(seed: int) -> None:
     for _ in range(6):
         n = int(random.integers(1, 9))
         data = (random.random(n) < 0.5).astype(np.uint8)
-        output.play(Span(Edges(at_s, period_s), 30, data, int(random.integers(0, n))))
+        output.play(Samples(Edges(at_s, period_s), 30, data, int(random.integers(0, n))))
         at_s = round(at_s + int(random.integers(5, 50)) * period_s, 6)
     times = np.arange(0.9, at_s + 1.0, period_s)
     levels = output.values(times + period_s / 2)

@@ -52,7 +52,7 @@ class SerialServer(WireServer[SerialModel]):
 
     @property
     def address(self) -> str:
-        """The same path."""
+        """The port's path, which is the address that a config names."""
         return self.path
 
     def close(self) -> None:

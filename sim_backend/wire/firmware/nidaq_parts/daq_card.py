@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_backend.wire.firmware.helios import KEEP_S
 from sim_backend.wire.firmware.nidaq_parts import daq_task as ni
-from sim_backend.wire.firmware.nidaq_parts.daq_outputs import EARLY, Edges, Output, Span
+from sim_backend.wire.firmware.nidaq_parts.daq_outputs import EARLY, Edges, Output, Samples
 from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, Task, expand
 
 START_DELAY_TICKS: Final = 2
@@ -238,7 +238,7 @@ class Card:
             delay, high, low = task.pulse
             edges = Edges(task.edges.at(max(0, delay - 1)), task.edges.period_s)
             data = np.repeat([1, 0], [high, low])
-            self.outputs[task.outputs[0]].play(Span(edges, task.limit * (high + low), data))
+            self.outputs[task.outputs[0]].play(Samples(edges, task.limit * (high + low), data))
             return
         repeated = task.buffer is not None
         for begin, rows in [(sample, task.buffer)] if task.buffer is not None else list(task.chunks):
@@ -247,4 +247,4 @@ class Card:
             if count > 0:
                 at = Edges(task.edges.at(begin + skipped - task.played), task.edges.period_s)
                 for output, row in zip(task.outputs, rows, strict=True):
-                    self.outputs[output].play(Span(at, count, row, begin % size if repeated else skipped))
+                    self.outputs[output].play(Samples(at, count, row, begin % size if repeated else skipped))

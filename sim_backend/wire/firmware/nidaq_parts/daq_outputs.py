@@ -46,7 +46,7 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
+class Samples:
     """Samples of one output at edges of a clock: `count` of them (inf: until it is cut), taken cyclically from `data`,
     beginning with sample number `first`. The last one holds until the next span.
     """
@@ -90,9 +90,9 @@ class Output:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rest = 0.0
-        self._spans: deque[Span] = deque()
+        self._spans: deque[Samples] = deque()
 
-    def play(self, span: Span) -> None:
+    def play(self, span: Samples) -> None:
         """Play a span from its first edge on, in place of all that was to come then and later."""
         self.cut(span.edges.first_s)
         with self._lock:
@@ -100,7 +100,7 @@ class Output:
 
     def put(self, value: float, time_s: float) -> None:
         """Go to a value, and hold it."""
-        self.play(Span(Edges(time_s, 1e-9), 1, np.array([value])))
+        self.play(Samples(Edges(time_s, 1e-9), 1, np.array([value])))
 
     def cut(self, time_s: float) -> None:
         """Hold the value that the output has right before a time."""
