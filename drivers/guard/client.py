@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
 
-from drivers.errors import DeviceError, DeviceTimeout, GuardLost
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceTimeout, GuardLost
 from drivers.guard.channel import Channel, Heartbeat, Message, error_from, plain_ports
 from drivers.guard.process import Rescue
 from drivers.guard.watch import GuardLimits, WatchedProcess
@@ -43,6 +43,9 @@ class _Guarded(Device):
 
     def _ask(self, verb: str, *arguments: Any) -> Any:
         return self._guard.ask(self._slot, verb, *arguments)
+
+    def _lost_at_close(self, error: DeviceDisconnected) -> None:
+        raise error  # a scan whose light could not be ended has not ended well
 
     def _do_close(self) -> None:
         if not self._guard.lost:

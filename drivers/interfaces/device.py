@@ -77,7 +77,7 @@ class Device(ABC):
         try:
             self._make_safe()
         except DeviceDisconnected as error:
-            _log.error("%s: closed, but it could not be left safe: %s", self._name, error)
+            self._lost_at_close(error)
         finally:
             self._state = DeviceState.CLOSED
             self._do_close()
@@ -103,6 +103,10 @@ class Device(ABC):
     @abstractmethod
     def _make_safe(self) -> None:
         """End what still runs; called once by `close`, in any state. Each interface implements it."""
+
+    def _lost_at_close(self, error: DeviceDisconnected) -> None:
+        """Say that the device was unplugged, so that `close` could not leave it safe."""
+        _log.error("%s: closed, but it could not be left safe: %s", self._name, error)
 
     @abstractmethod
     def _do_close(self) -> None:

@@ -8,7 +8,8 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceDisconnected, DeviceError
+from drivers.interfaces.device import Device
 
 SEEDS_APART = 1_000_000
 CHUNK = 20
@@ -53,6 +54,16 @@ def ending(act: Callable[[], str], now_s: Callable[[], float], deadline_s: float
         end, wrong = "foreign", f"{type(error).__name__}: {error}"
     took_s = now_s() - begun_s
     return Ending([end], wrong or (f"took {took_s:.1f} s" if took_s > deadline_s else None), took_s)
+
+
+def close_or_raise(device: Device) -> None:
+    """Close a device; unlike `close` alone, raise the error if it was lost before it was safe."""
+
+    def raise_it(error: DeviceDisconnected) -> None:
+        raise error
+
+    device._lost_at_close = raise_it  # type: ignore[method-assign]
+    device.close()
 
 
 class Verbs:

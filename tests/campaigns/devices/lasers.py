@@ -19,7 +19,7 @@ from drivers.transports.dialogue import LineTiming
 from sim_backend.wire.firmware.cobolt import CoboltModel, Family
 from sim_backend.wire.firmware.ibeam import BIAS, NORMAL, IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
-from tests.campaigns.outcomes import Ending, Verbs
+from tests.campaigns.outcomes import Ending, Verbs, close_or_raise
 from tests.wire.faults import Fault, FaultSchedule
 from tests.wire.serial_wire import SerialWire
 
@@ -151,7 +151,8 @@ class Sequence:
         self._close()
 
     def _close(self) -> None:
-        if self._laser is not None and self._verb("close", self._laser.close):
+        laser = self._laser
+        if laser is not None and self._verb("close", lambda: close_or_raise(laser)):
             self._stays_dark("closed")
         self._laser = None
 

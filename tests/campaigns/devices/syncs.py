@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from drivers.errors import DeviceError
 from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse, SyncSource
-from tests.campaigns.outcomes import Ending, Verbs
+from tests.campaigns.outcomes import Ending, Verbs, close_or_raise
 from tests.wire.faults import Fault, FaultSchedule
 
 VERBS = 6
@@ -103,7 +103,7 @@ class Sequence:
         for _ in range(VERBS):
             verb = self._random.choice(verbs)
             self._verb(verb.__name__, lambda verb=verb: verb(device))  # type: ignore[misc]
-        if self._verb("close", device.close):
+        if self._verb("close", lambda: close_or_raise(device)):
             self._require_low()
 
     def _open(self) -> None:
