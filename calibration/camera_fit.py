@@ -4,7 +4,7 @@ Three kinds of corners are left out: those of a view that does not fit the other
 corners are in another order), single corners that do not fit their view, and those of a board seen from behind, which
 is a mirror image. Views that lose more than one corner are named. cv2.calibrateCamera fits the remaining corners. The
 covariance is s^2 (J^T J)^-1 with the poses free, J the derivatives of the corners' pixels and s^2 the residuals'
-variance, so it counts errors of the lens model as noise.
+variance (LEAST_SD_PX squared at least), so it counts errors of the lens model as noise.
 
 The normal equations, with free poses, decide whether the corners determine a camera: by their condition number and by
 the sd of the focal length. The angles between the boards only decide how a refusal is worded, and whether all
@@ -121,7 +121,7 @@ class CameraProblem:
         )
 
     def solve(self, used: Sequence[Mask]) -> CameraSolution:
-        """The least squares camera from the corners used, and the poses of all views. May raise Degenerate."""
+        """The least squares camera from the corners used, and the poses of all views. Raises Degenerate if it fails."""
         kept = [i for i, mask in enumerate(used) if mask.any()]
         points = [self.points_m(i)[used[i]].astype(np.float32) for i in kept]
         px = [self.corners[i].px[used[i]].astype(np.float32) for i in kept]
@@ -240,7 +240,7 @@ def _of_used(of_views: Sequence[Kind], used: Sequence[Mask]) -> tuple[Kind, ...]
 
 
 def rms(residual_px: Array) -> float:
-    """Root of the mean of dx^2 + dy^2, which is the rms distance as OpenCV counts it."""
+    """Root of the mean of dx^2 + dy^2, which is the rms distance as OpenCV counts it; NaN without residuals."""
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=-1)))) if len(residual_px) else float("nan")
 
 
@@ -255,7 +255,7 @@ _FEW_CORNERS = 1
 _LEAST_CLOSE = 0.7
 """Least share of a view's corners that must fit; with fewer, none of them is used."""
 _FEWEST_VIEWS = 3
-"""Fewest views that stay in the fit, even if they are outliers."""
+"""With so few views left in the fit, none is dropped for its scatter; its corners may still be left out."""
 _MAX_ROUNDS = 20
 
 
@@ -264,7 +264,7 @@ class CameraFit:
     """A camera and the data it was fitted to. Sequences run over the views with enough corners, which `views` names.
 
     residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
-    of their distances. outliers: names of the views that do not fit, entirely or in more than one corner. condition:
+    distance of those. outliers: names of the views with more than one corner left out, mirrored ones too. condition:
     condition number of the normal equations at unit diagonal. spread_rad: largest angle between the boards in the fit.
     """
 
@@ -340,7 +340,7 @@ def fit_camera(views: Sequence[View], board: Board, size: tuple[int, int], *, di
 def _without_outliers(
     problem: CameraProblem, solution: CameraSolution, used: list[Mask]
 ) -> tuple[CameraSolution, list[Mask]]:
-    """Repeat the fit without outliers, first one view at a time, then single corners, until nothing changes."""
+    """Repeat the fit without outliers, first one view at a time, then single corners, in at most _MAX_ROUNDS rounds."""
     dropped = {i for i, mask in enumerate(used) if not mask.any()}
     behind = frozenset(dropped)
     sds = [found.likely_sd_px for found in problem.corners]

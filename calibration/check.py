@@ -4,7 +4,7 @@ A board at an unknown pose is scanned. The scanned points of each of its squares
 averages from their best plane are the flatness error. The board's corners are put on that plane along their rays; the
 size of their pattern, divided by its size on the board, is the scale. Two boards give the angle between them. Each
 result comes with the error expected from the model's covariance and the scan's noise. With m the deviations (cells,), C
-their expected covariance and P the projection that removes a plane,
+their expected covariance, P the projection that removes a plane, and ^+ the pseudo-inverse,
 
     chi2 = (P m)' (P C P)^+ (P m)    with cells - 3 degrees of freedom.
 """
@@ -104,8 +104,8 @@ def _triangulated(model: RigModel, x_px: Array, y_px: Array, command: Array, vel
 
 
 def _scanned(model: RigModel, view: View, board: Board) -> Iterator[tuple[Passages, Array, Array]]:
-    """Each sweep of a view; where its pixels lie on the board (m, 2), metres, NaN off its squares; and its points
-    (m, 3) in the camera's frame, NaN where the command lies outside the model's range.
+    """Yield each sweep of a view; where its pixels lie on the board (m, 2), metres, NaN off its squares; and its points
+    (m, 3) in the camera's frame, NaN where there is no depth or the command lies outside the model's range.
 
     A homography maps rays to the board. Raises Degenerate if the corners are too few to locate the board.
     """

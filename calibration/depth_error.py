@@ -3,9 +3,9 @@
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
 C is the covariance. The part of a group g of parameters is the variance that would vanish if they were known exactly,
-J C_.g C_gg^-1 C_g. J', where C_.g are the group's columns of C. It lies between 0 and the total, and is the group's own
-variance if the group is correlated with no other. Correlated groups share variance, so parts may add up to more than
-the total.
+J C_.g C_gg^-1 C_g. J', with C_.g and C_g. the group's columns and rows of C, and C_gg its block. The part lies between
+0 and the total, and is the group's own variance if the group is correlated with no other. Correlated groups share
+variance, so parts may add up to more than the total.
 
 There is also the covariance of any other number that follows from a model (`propagated`), the effect on depth of an
 error in the mirror's command or in the stripe's position (`sensitivity`), and, if a simulation knows the true model,
@@ -65,7 +65,7 @@ _SEARCH_STEPS = 60
 _FOUND_M = 1e-9
 """A mirror command is found when its sheet is this near to the point: a thousandth of any calibration's error."""
 _INSIDE = 1e-6
-"""Distance from the ends of the command range, as a share of it, at which differences are taken there."""
+"""Least distance from the ends of the command range, as a share of it, at which differences are taken."""
 _INDEPENDENT = 1e-12
 """Eigenvalues of a correlation matrix below this are rounding."""
 
@@ -95,7 +95,7 @@ class DepthUncertainty:
 
     def line(self) -> str:
         """One line such as 'at 5 m: 8 mm, 6 of them from the baseline', with medians over the picture and the largest
-        part.
+        part; or 'at 5 m: not lit'.
         """
         at = f"at {self.depth_m:g} m"
         if not np.isfinite(self.sd_m).any():
@@ -110,8 +110,8 @@ class DepthUncertainty:
 def depth_uncertainty(model: RigModel, depth_m: float, velocity_per_s: float | None = None) -> DepthUncertainty:
     """The uncertainty at a given depth over the picture.
 
-    velocity_per_s: signed velocity of the command, which multiplies the lag. None: the highest speed of a rising
-    command for which the lag holds, or 0 if the lag was not measured. Raises CalibrationError for a model without
+    velocity_per_s: signed velocity of the command, which multiplies the lag. None: that of a command rising at the
+    highest speed for which the lag holds, or 0 if the lag was not measured. Raises CalibrationError for a model without
     covariance.
     """
     covariance = _covariance(model)
@@ -139,7 +139,7 @@ def depth_sd_m(
 
 
 def command_at(model: RigModel, x_px: ArrayLike, y_px: ArrayLike, depth_m: ArrayLike) -> Array:
-    """Mirror command at which the light reaches raw pixels at a depth; NaN if that is outside the command range."""
+    """Mirror command at which the light reaches raw pixels at a depth; NaN if the command range holds none."""
     z = np.asarray(depth_m, np.float64)
     u, v = model.camera.tangents_at(x_px, y_px)
     points = np.stack(np.broadcast_arrays(u * z, v * z, z), axis=-1)
@@ -229,8 +229,8 @@ _DISTANCES_M: Final = np.geomspace(0.05, 100.0, 60)
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Change of depth with the command (m per command unit) and with the stripe's position (m per pixel). Each is the
-    median over the pixels that the line reaches.
+    """Size of the change of depth with the command (m per command unit) and with the stripe's position (m per pixel).
+    Each is the median over the pixels that the line reaches.
     """
 
     per_command_m: float
@@ -274,7 +274,7 @@ _TRUTH_GRID = 32
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors at the pixels that the true rig lights at one depth; NaN if there are none.
+    """Errors at the pixels that the true rig lights at one depth and that have a depth in the model; NaN without any.
 
     median_m, worst_m: of the absolute errors. ratio: root mean square of the errors, each divided by the sd that the
     model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. The

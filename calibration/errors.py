@@ -6,34 +6,32 @@ import numpy as np
 
 
 class CalibrationError(ValueError):
-    """Raised for input that cannot be used. One line names the thing, the value, the limit and the next step."""
+    """Raised for input that cannot be used. One line says what is wrong and, mostly, value, limit and next step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
     """Raised for input from which no model follows. reason: a code for programs, such as 'one-pose'."""
 
     def __init__(self, reason: str, message: str) -> None:
-        """Take the reason, and the message: what is wrong, its value and limit, the condition number, the next step."""
+        """Take the reason, and the message as in `CalibrationError`."""
         super().__init__(message)
         self.reason = reason
 
 
 class FileError(CalibrationError):
-    """Raised for a file that cannot be used. `problems` lists everything wrong with it, one line each; the message has
-    the first `MOST_TOLD`.
-    """
+    """Raised for a file that cannot be used. `problems`: one line each; the message has the first MOST_TOLD."""
 
     MOST_TOLD = 5
 
     def __init__(self, *problems: str) -> None:
-        """Take the lines, each of which names the file."""
+        """Take the problems. Each is one line that names the file or the option."""
         more = f"; and {len(problems) - self.MOST_TOLD} more" if len(problems) > self.MOST_TOLD else ""
         super().__init__("; ".join(problems[: self.MOST_TOLD]) + more)
         self.problems = problems
 
 
 def digits(value: float, count: int = 3) -> str:
-    """A number rounded to that many significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for nan."""
+    """A number rounded to `count` significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for NaN."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else f"{value:g}"
     value = value + 0.0  # -0 is 0
@@ -41,7 +39,7 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def condition_text(condition: float) -> str:
-    """A condition number, of which the power of ten matters: '3.1e+07'; 'inf' if nothing is determined."""
+    """A condition number, of which the power of ten matters: '3.1e+07'; 'inf' if it is not finite."""
     return f"{condition:.1e}" if np.isfinite(condition) else "inf"
 
 

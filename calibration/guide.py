@@ -1,8 +1,8 @@
 """Advice on the board's next pose, and why: the pose after which the expected depth error is smallest.
 
 Candidates form a grid of distance, place in the picture and tilt. `Forecast` predicts the gain of each from the fit of
-the views so far. Before there is a fit, and always without guidance, the poses of `sequence` are shown, which differ as
-much as possible.
+the views so far. Before there is a fit, and throughout a calibration without guidance, the poses of `sequence` are
+shown, which differ as much as possible.
 
 A pose that has not been shown has no data, but the normal equations need none: they need derivatives and noise. The fit
 so far gives the places of corners and passages at the new pose and their derivatives by the parameters; the other views
@@ -32,7 +32,7 @@ from calibration.rig_fit.solve import Weights, scaled_inverse, view_normal
 from calibration.views import FEWEST_CORNERS, BoardPose
 
 FILLS = (0.6, 0.45, 0.32, 0.22)
-"""Share of the picture's width or height, whichever is reached first, that the board fills; sets its distance."""
+"""Shares of the picture's width or height, whichever is reached first, that boards fill; they set the distances."""
 PLACES = {
     (0, 0): "in the middle of the picture",
     (-1, 0): "at the left border",
@@ -57,15 +57,15 @@ TILTS = {
 LEAST_MODULE_PX = 2.0
 """Side of a marker's module in the picture; smaller ones are not read when tilted and noisy."""
 _BORDER_SHARE = 0.03
-"""Share of the picture left free around the board."""
+"""Share of the picture's width and height left free on each side of the board."""
 
 ExpectedError = Callable[[BoardPose], float]
-"""The expected depth error (m) once this pose has been shown too."""
+"""The expected depth error (m) once this pose has been shown too; NaN if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A pose to show. fill: one of FILLS; distance_m: of the board's middle; place, tilt: keys of PLACES and TILTS."""
+    """A pose to show. fill: one of FILLS. distance_m: depth of the board's middle. place, tilt: from PLACES, TILTS."""
 
     fill: float
     distance_m: float
@@ -85,8 +85,8 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """The next pose. before_m, after_m: expected depth error at `at_m` before and after this pose; NaN before there
-    is a fit."""
+    """The next pose. before_m, after_m: expected depth error at `at_m` before and after this pose; NaN if unknown, as
+    before there is a fit."""
 
     candidate: Candidate
     at_m: float
@@ -113,7 +113,7 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
 
 
 def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
-    """The best of the given poses (at least one) by the forecast, as the pose to show next."""
+    """The best of the given poses (at least one) by the forecast, as the next pose; the first one if all are NaN."""
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))
@@ -121,9 +121,9 @@ def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast:
 
 def sequence(choices: Sequence[Candidate], poses: int, seed: int = 0) -> tuple[Candidate, ...]:
     """The requested number of poses, which differ from one another as much as possible: near and far, in all places and
-    tilts.
+    tilts. They repeat once all `choices` (at least one) are used.
 
-    Each is the one farthest from those before it; the first is near and tilted. seed: chooses among equal ones.
+    Each is the one farthest from those before it; the first is the nearest tilted one. seed: chooses among equal ones.
     """
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(choices)) if seed else np.arange(len(choices))
@@ -259,7 +259,7 @@ class Forecast:
 
 
 def _next_velocities(fit: RigFit) -> tuple[float, ...]:
-    """The velocities of the next view's sweeps: views use a few sets in turn, and the one used longest ago is next."""
+    """The velocities of the next view's sweeps. Views use a few sets in turn; the set used longest ago is next."""
     shown = [tuple(sweep.direction * sweep.speed_per_s for sweep in view) for view in fit.sweeps if view]
     last = {velocities: turn for turn, velocities in enumerate(shown)}
     return min(last, key=last.__getitem__)

@@ -43,12 +43,12 @@ from calibration.files.npy_files import load_arrays
 from calibration.views import robust_sd
 
 LEAST_COUNTS = 10.0
-"""Least mean counts in a block from which a pixel's scatter is judged; chi-square does not describe smaller counts."""
+"""Least mean number of 1s, and of 0s, in a block for a pixel's scatter to be judged; below, it is no chi-square."""
 LEAST_BLOCKS, MOST_BLOCKS = 8, 64
 _APART, _ROUNDS = 6.0, 8
 """An ordinary pixel counts at most this multiple of (sd + 1) above the expected counts; rounds of this selection."""
 _MANY, _MOST_COMMON = 100, 1.5
-"""If so many pixels are judged, the scatter common to them is removed, up to this factor in variance."""
+"""If at least so many pixels are judged, the scatter common to them is removed, up to this factor in variance."""
 
 
 class DarkTally:
@@ -132,11 +132,12 @@ class PixelMap:
     """The result for each pixel; arrays are (rows, width).
 
     rate_per_s, rate_sd_per_s: float32, dark counts per second; NaN where no frame contained the pixel. jump_per_s:
-    float32, sd of the rate between blocks beyond that of counting, 0 if there is none or it is unknown. hot, noisy:
-    bool. dead: None if there was no light. judged, lit_judged: share of the pixels that fired often enough to tell
-    whether they are noisy, and that were lit well enough to tell whether they are dead. defects: pixels that are hot,
-    dead, or noisy with jumps that reach the limit. limit_per_s: float32, the rate above which a pixel is hot. frames:
-    largest number of frames of a pixel. ordinary_per_s: mean dark rate of the ordinary pixels.
+    float32, sd of a noisy pixel's rate between blocks beyond that of counting, 0 for all other pixels. hot, noisy:
+    bool. dead: None if there was no light. judged: share of the pixels whose data tell whether they are noisy.
+    lit_judged: share lit well enough to tell whether they are dead, 0 without light. defects: pixels that are hot,
+    dead, or noisy with jumps that reach the limit. limit_per_s: float32, the rate that a hot pixel exceeds; hot pixels
+    also stand out from their neighbours. frames: largest number of frames of a pixel. ordinary_per_s: mean dark rate of
+    the ordinary pixels.
     """
 
     rate_per_s: NDArray[np.float32]
@@ -228,8 +229,8 @@ def dead_pixels(
     """Pixels (rows, width) with less than `DEAD_SHARE` of their neighbours' light, and the pixels for which this can be
     judged.
 
-    A pixel with half of its neighbours' light would count so little with a probability below `false_alarm` (Chernoff's
-    bound). So in too dim a light no pixel is called dead.
+    Dead pixels count so little that one with half of its neighbours' light would do so with a probability below
+    `false_alarm` (Chernoff's bound). So in too dim a light no pixel is called dead.
     """
     around = _around(flux_of(ones, frames)[0])
     n = np.broadcast_to(np.asarray(frames, np.float64), ones.shape)
@@ -242,7 +243,7 @@ def dead_pixels(
 
 
 def light_leak(pixels: PixelMap) -> float:
-    """Correlation of ordinary neighbours' rates along the rows, a sign of stray light; 0 if chance explains it."""
+    """Correlation of ordinary neighbours' rates along the rows, a sign of stray light; 0 if it may be chance."""
     rate = np.where(pixels.defects, np.nan, pixels.rate_per_s.astype(np.float64))
     low, high = np.nanpercentile(rate, [1.0, 95.0])
     rate[(rate < low) | (rate > high)] = np.nan
@@ -279,7 +280,7 @@ def _chi_square_limit(dof: NDArray[np.int64], probability: float) -> Array:
 SIGNIFICANT = 5.0
 """Counting sds by which a rate must differ to count as changed."""
 MOST_RATIO = 2.0
-"""Common factor between two maps, as after 8 to 10 K, from which on the old map's limits and rates are useless."""
+"""Common factor between two maps, as after 8 to 10 K either way, from which on the old limits and rates are useless."""
 MOST_NEW_DEFECTS = 0.005
 """Largest share of all pixels that may have become defects."""
 LEAST_ALIKE = 0.5
@@ -292,12 +293,12 @@ _LEAST_HOT = 10
 class PixelDrift:
     """The change from an older map to a newer one.
 
-    became_hot, became_dead, recovered: (n, 2) row and column; hot and recovered ones only if the change is more than
-    chance, dead ones only if both maps were made with light. ratio: of the ordinary pixels' rates, newer to older;
-    ratio_sigma: its distance from 1 in sd. changed: share of the pixels whose rates differ by more than chance after
-    this factor is removed. correlation: of the logarithms of the rates, NaN if fewer than two pixels have both or all
-    are equal. alike: share of the old hot pixels that are still hot, None if too few. new_defects: share of all pixels
-    that became hot or dead.
+    became_hot, became_dead, recovered: (n, 2) row and column; recovered ones were hot. Hot and recovered ones count
+    only if the change is more than chance, dead ones only if both maps were made with light. ratio: of the ordinary
+    pixels' rates, newer to older; ratio_sigma: its distance from 1 in sd. They are 1 and 0 without such rates. changed:
+    share of the pixels whose rates differ by more than chance after this factor is removed. correlation: of the
+    logarithms of rates above 0; NaN for fewer than two pixels, or if all of one map are equal. alike: share of the old
+    hot pixels that are still hot, None if too few. new_defects: share of all pixels that became hot or dead.
     """
 
     became_hot: NDArray[np.int64]
@@ -362,7 +363,7 @@ def _ratio(
     sd_before: NDArray[np.float64],
     sd_after: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Ratio of the sums of two sets of rates, and its distance from 1 in sd; (1, 0): nothing to compare."""
+    """Ratio of the sums of two sets of rates, newer to older, and its distance from 1 in sd; (1, 0) if a sum is 0."""
     old, new = float(before.sum()), float(after.sum())
     if old <= 0 or new <= 0:
         return 1.0, 0.0
@@ -408,7 +409,7 @@ class PixelVersion:
 
 
 def save_pixels(version: PixelVersion, path: str | os.PathLike[str]) -> None:
-    """Write a version to a file, completely or not at all. Raises OSError."""
+    """Write a version to a file, completely or not at all. Raises OSError if that fails."""
     file, pixels = Path(path), version.pixels
     about = {"format": FORMAT, **{name: getattr(version, name) for name in ("version", "created", "parent", "sensor")}}
     about |= {name: getattr(pixels, name) for name in ("frames", *_NUMBERS)}
@@ -426,7 +427,7 @@ _DAMAGE = (ArithmeticError, AttributeError, KeyError, RecursionError, TypeError,
 
 
 def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
-    """Read a version from a file. Raises CalibrationError if the file holds none."""
+    """Read a version from a file. Raises CalibrationError if the file cannot be read or holds none."""
     file = Path(path)
     try:
         archive = load_arrays(file)

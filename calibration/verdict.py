@@ -30,7 +30,7 @@ class AccuracyGoal:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A reason against a calibration: code for programs, text for people, value and limit in one unit."""
+    """A reason against a calibration: code for programs, text for people, value and limit in one unit (NaN: none)."""
 
     code: str
     text: str
@@ -39,13 +39,13 @@ class Reason:
     next_step: str
 
     def __str__(self) -> str:
-        """One line."""
+        """Code, text and next step in one line."""
         return f"{self.code}: {self.text}; {self.next_step}"
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a calibration may be used, and why not, with the root cause first."""
+    """Whether a calibration may be used, and why not; of a fit, the most likely root cause comes first."""
 
     passed: bool
     reasons: tuple[Reason, ...] = ()
@@ -90,7 +90,7 @@ _NEXT_STEP = {
 
 
 def reason_for(code: str, text: str, value: float = math.nan, limit: float = math.nan) -> Reason:
-    """A reason with the next step that belongs to its code."""
+    """A reason with the next step that belongs to its code; for any other code, to show the board again."""
     return Reason(code, text, value, limit, _NEXT_STEP.get(code, "show the board again"))
 
 
@@ -101,11 +101,12 @@ def unguided(verdict: Verdict) -> Verdict:
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """The reason if data are simply too few, with an estimate of how many poses would be enough.
+    """The reason if data are simply too few. The text estimates how many poses would be enough, or says that more will
+    not do if these exceed MOST_POSES. It does neither if the error is not finite.
 
-    shown: number of poses so far. what: words for the error, with the verb. found: median and 95th percentile of
-    the error over the picture. asked: limit of the median; the text names the one that exceeds its limit more. said:
-    turns an error into text.
+    shown: number of poses so far. what: words for the error, with the verb. found: median and 95th percentile of the
+    error over the picture; the text names the one that exceeds its limit more. asked: limit of the median, that of the
+    percentile is WORST_TIMES as large. said: turns an error into text.
     """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]
     worst = over[1] > over[0]

@@ -1,7 +1,7 @@
 """One view of a calibration board held still: where its corners lie, and when the line passed over each pixel.
 
-A pixel's passage is the mirror command at which the line's centre crosses it. The pixel's albedo is the same in every
-column, so the board's print does not bias the passage. The print does bias a stripe's position along a row.
+A pixel's passage is the mirror command at which the line's centre crosses it. At every command the pixel sees the same
+spot, so the board's print hardly biases the passage. The print does bias a stripe's position along a row.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ LEAST_ACROSS_PX = 1.0
 class Corners:
     """Corners of a board in a picture.
 
-    ids: (n,) int32, the board's numbers. px: (n, 2) float64 raw pixels, centres at integers. sd_px: (n,) float64, of
-    either coordinate, from the picture's noise; None if unknown.
+    ids: (n,) int32, the corners' numbers on the board. px: (n, 2) float64 raw pixels, centres at integers. sd_px: (n,)
+    float64, sd of either coordinate, from the picture's noise; None if unknown.
     """
 
     ids: NDArray[np.int32]
@@ -35,7 +35,7 @@ class Corners:
 
     @property
     def likely_sd_px(self) -> Array:
-        """(n,) sd of either coordinate, above 0; the usual one if unknown."""
+        """(n,) sd of either coordinate in pixels, above 0: USUAL_CORNER_SD_PX where unknown, 1 where infinite."""
         if self.sd_px is None:
             return np.full(len(self.ids), USUAL_CORNER_SD_PX)
         known = np.nan_to_num(self.sd_px, nan=USUAL_CORNER_SD_PX, posinf=1.0)
@@ -75,7 +75,9 @@ class Passages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One pose of the board as seen and scanned. picture: (height, width) float32, photons per pixel and exposure."""
+    """One pose of the board as seen and scanned. corners: None if not found. passages: of each sweep. picture: (height,
+    width) float32, photons per pixel and exposure, or grey levels if it comes from an image file.
+    """
 
     name: str
     corners: Corners | None
@@ -85,8 +87,8 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
-    """The pose of a board: X_camera = R X_board + position. rotation: (3,) float64 Rodrigues vector in rad; position_m:
-    (3,) float64.
+    """The pose of a board: X_camera = matrix X_board + position_m. rotation: (3,) float64 Rodrigues vector in rad;
+    position_m: (3,) float64.
     """
 
     rotation: Array
@@ -107,7 +109,5 @@ MAD_TO_SD: Final = 1.4826
 
 
 def robust_sd(deviations: ArrayLike) -> float:
-    """Standard deviation of deviations (n,) from zero, estimated from the median of their absolute values; n is above
-    0.
-    """
+    """Standard deviation of deviations (n,) from zero, n > 0, estimated from the median of their absolute values."""
     return float(MAD_TO_SD * np.median(np.abs(deviations)))

@@ -57,6 +57,6 @@ class VirtualClock:
                 self._now_ns += round(seconds * NS_PER_S)
 
     def advance_to_ns(self, t_ns: int) -> None:
-        """Advance to `t_ns`. A time that has already passed changes nothing, since the clock never runs backwards."""
+        """Advance to `t_ns`. A time that has already passed changes nothing: the clock never runs backwards."""
         with self._lock:
             self._now_ns = max(self._now_ns, t_ns)

@@ -9,7 +9,9 @@ class DeviceError(Exception):
 
 
 class DeviceNotFound(DeviceError):
-    """Raised when a device to be opened is not attached, or is silent at its address, or its recording is missing."""
+    """Raised when a device to be opened is not attached or does not answer as its kind does, when its address is no
+    usable one, or when a recording cannot be found or read.
+    """
 
 
 class DeviceBusy(DeviceError):
@@ -29,7 +31,7 @@ class DeviceDisconnected(DeviceError):
 
 
 class DeviceFault(DeviceError):
-    """Raised when a device reports a fault of its own, or reads back a state other than the one it was set to."""
+    """Raised when a device reports a fault of its own, or does something else than it was told."""
 
 
 class InterlockOpen(DeviceError):
@@ -37,14 +39,12 @@ class InterlockOpen(DeviceError):
 
 
 class LimitExceeded(DeviceError):
-    """Raised when a request is outside a device's limits, before anything moves or lights. Names the value and the
-    limit.
-    """
+    """Raised when a request is outside a device's limits, or malformed, before anything moves or lights."""
 
 
 class WrongState(DeviceError):
     """Raised when the device's state does not allow the method that is called, or another thread has interrupted that
-    method (as `pause` interrupts `arm`). Says what to do instead.
+    method (as `pause` interrupts `arm`).
     """
 
 
@@ -58,12 +58,12 @@ class CommandRefused(ProtocolError):
 
 
 class CorruptBlock(ProtocolError):
-    """Raised when the magic, checksum, sizes or trailer of a block or index are wrong. It must not be used."""
+    """Raised when a block or an index is damaged, or is not the one that is expected. It must not be used."""
 
 
 class UnsupportedBlock(ProtocolError):
-    """Raised when a block is of a kind that this reader does not take: another major version, sparse, summed, with
-    every k-th frame only, or without frames.
+    """Raised when a block is of a kind that `drivers.spb1` does not read as frames: another major version, several bits
+    per pixel, sparse, summed, with every k-th frame only, or a control block.
     """
 
 

@@ -1,5 +1,5 @@
-"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each. A
-run in this module is one start of the SPAD."""
+"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each. A run in this module is
+one start of the SPAD."""
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 FRAME_RECORD = np.dtype(
     [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
 )
-"""One frame's record, 16 bytes, as in SPB1 1.0. marks: bits of `Mark`; ticks: from the block's `t0_ticks` to the start
-of the exposure; x0, y0: corner of the window in pixels; line: number of line markers since the last scan marker; sweep:
-number of scan markers since the run's start (low 16 bits)."""
+"""One frame's record, 16 bytes, as in SPB1 1.0. marks: bits of `Mark`, and a time from `SUBFRAME_SHIFT` on; ticks: from
+the block's `t0_ticks` to the start of the exposure; x0, y0: first column and row of the window, in pixels; line: number
+of line markers since the last scan marker; sweep: number of scan markers since the run's start (low 16 bits). A marker
+during a frame is counted in that frame's record."""
 
 ROW_ALIGN_BYTES = 8
 """Rows are padded to whole 64-bit words, on which the counting runs."""
 
 SUBFRAME_SHIFT = 8
 SUBFRAME_MASK = 0xFF
-"""Bits 8-15 of `marks`: time of the frame's latest edge, in 1/256 of the frame period after its start."""
+"""Bits 8-15 of `marks`: time of the latest LINE, SCAN or TRIGGER edge, in 1/256 of the frame period after its start."""
 
 
 class Mark(IntFlag):
@@ -94,7 +95,7 @@ class BlockHeader:
     """Nominal period; 0 = triggered from outside."""
     exposure_ticks: int
     sweep: int
-    """Number of scan markers since the run's start, up to the first frame."""
+    """Number of scan markers since the run's start, up to and including the first frame."""
     frame_step: int
     """1, or k if the device keeps every k-th frame or sums k frames."""
     width: int

@@ -1,5 +1,5 @@
-"""The only reader of JSON files. Text that nests too deep or holds integers of more than 20 digits raises ValueError
-like any other damage.
+"""Reads JSON texts that may be damaged. A text that nests too deep, or holds an integer of more than 20 digits, raises
+ValueError like any other damage.
 """
 
 import json

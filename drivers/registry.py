@@ -33,8 +33,8 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The things that a device needs besides its config. Real devices use clock, ports and tap, simulated ones world
-    and seed.
+    """The things that a device needs besides its config. Real devices use clock, ports and tap, simulated ones clock,
+    world and seed.
     """
 
     clock: Clock
@@ -61,8 +61,8 @@ class Kind:
     one cannot be used. None: the config names no file, or the kind is a world (creating the world is the check).
     """
     off: Callable[[Any], bytes] | None = None
-    """Function that returns, for a config, the bytes that switch off a laser on a serial port in any state. They are
-    sent if there is no time to open the laser first."""
+    """Function that returns, for a config, the bytes that switch off a laser on a serial port, whatever state it is
+    in. They are sent if there is no time to open the laser first."""
 
 
 Config = TypeVar("Config", bound=BaseModel)
@@ -80,7 +80,7 @@ def config_of(kind: type[Config], **fields: object) -> Config:
 
 
 def quantity(name: str, value: float | Fraction, dimension: str) -> str:
-    """The text with a unit of an argument in SI units. Raises `LimitExceeded` if it is no finite number."""
+    """An argument in SI units, written as text with a unit. Raises `LimitExceeded` if it is no finite number."""
     try:
         return format_quantity(value, dimension)
     except (TypeError, ValueError):

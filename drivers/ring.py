@@ -2,7 +2,7 @@
 
 The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
 of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a
-block's slot until it asks for the next block; with `holds` = n, until it asks for the n-th block after that one.
+block's slot until it asks for the next block; with `holds` = n, until it asks for the n-th block after the held one.
 
 The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. If they claim and
 get no slot, and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
@@ -55,7 +55,7 @@ class BlockRing:
         self.waited_s = 0.0
         """Time the source spent in `claim` because no slot was free."""
         self.last_frame = -1
-        """Number of the last frame that was published or dropped; -1 before the first."""
+        """Number of the last frame published (-1 before the first), plus the number of frames dropped since."""
         self.dropped_blocks = 0
         self.dropped_frames = 0
         """Blocks, and the frames in them, that the source dropped because no slot was free."""
@@ -86,9 +86,9 @@ class BlockRing:
         """A new reader. Raises `WrongState` after the first claim, since all readers are to see all blocks.
 
         holds: number of newest blocks that the reader keeps while it works on them. Raises ValueError if the ring has
-        too few slots for that.
+        too few slots for its readers.
         A reader with required=False (a monitor) never makes the source wait. It occupies one slot at most: it gets the
-        newest block, and misses the blocks that are published while it holds one. `skipped` counts those.
+        newest block. It misses older ones and those published while it holds a block. `skipped` counts what it misses.
         """
         with self._changed:
             if self._any_claimed:
@@ -134,7 +134,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished, for example if it holds a heartbeat or a damaged block."""
+        """Give the oldest claimed slot back unpublished. Raises `WrongState` if there is none."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()

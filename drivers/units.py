@@ -92,7 +92,7 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse as `parse_quantity` does, without rounding or bounds. Both functions accept fractions ("100000/3 Hz")."""
+    """Parse as `parse_quantity` does, but exactly and without bounds. Both accept fractions ("100000/3 Hz")."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -208,5 +208,5 @@ MetresPerHour = Annotated[float, _Text("rain rate")]
 CountsPerSecond = Annotated[float, _Text("count rate")]
 PerSecond = Annotated[float, _Text("rate")]
 PerSecondSquared = Annotated[float, _Text("acceleration")]
-"""Acceleration of the normalised drive, whose full range, -1 to 1, is 2."""
+"""Acceleration of a scanner's command, whose full range is -1 to 1, in 1/s2."""
 BytesPerSecond = Annotated[float, _Text("data rate")]

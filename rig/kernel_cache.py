@@ -4,9 +4,9 @@ Service accounts and containers often have no folder in which numba can store ke
 all, so `prepare_kernels` provides a folder.
 
 numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
-file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest of each
-module's source and of all modules that it imports, and removes the kernels of modules whose digest has changed. To
-check whether any file has changed takes a few milliseconds, to compute the digests a second.
+file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest for each
+module, of its source and the sources of all it imports, and removes the kernels of modules whose digest has changed.
+Checking whether any file has changed takes a few milliseconds, computing the digests a second.
 """
 
 import ast
@@ -22,7 +22,7 @@ VARIABLE = "NUMBA_CACHE_DIR"
 PACKAGES = "calibration", "drivers", "rig", "sim_backend"
 TOP = Path(__file__).parent.parent
 NOTE = "spadrig-kernels-{}.json"
-"""Name of the file with the digests. {} is a digest of the checkout's path, since several may share one folder."""
+"""Name of the file with the digests. {} is for a digest of the checkout's path: checkouts may share one folder."""
 
 
 def prepare_kernels() -> None:
@@ -35,7 +35,7 @@ def prepare_kernels() -> None:
 
 
 def forget_stale(top: Path, kept: Path | None) -> None:
-    """Remove the kernels of modules below `top` that have changed since the last call, or whose imports have.
+    """Remove the kernels of modules of PACKAGES in `top` that have changed since the last call, or whose imports have.
 
     kept: numba's folder; None if kernels lie beside their modules. If the digests cannot be stored, as on a full disk,
     the next call removes the same kernels again.
@@ -102,7 +102,7 @@ def _made_of(files: dict[str, Path]) -> dict[str, str]:
 
 
 def _imported(source: bytes) -> set[str]:
-    """Names that may be modules: `a.b` and `a.b.c` of `from a.b import c`."""
+    """Names that may be modules: `a.b` and `a.b.c` of `from a.b import c`. Relative imports are left out."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -124,7 +124,7 @@ def _writable(folder: Path) -> bool:
 
 
 def _private_folder() -> Path:
-    """A folder that only this user can write to. Kernels are code, and anybody can write to the temporary folder."""
+    """A folder that only this user can write to, since kernels are code. A new one if the usual one is not safe."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)

@@ -1,8 +1,8 @@
 """Requests of a user: a frozen dataclass for each command with many options, filled by the options or by a Python call.
 
 Each field has a type and a phrase that describes it, which `rig scan --help` and `help(ScanRequest)` show.
-`rig/cli/command.py` makes an option of each field. What None means is said at each field. For settings
-that a config has too, it is the config's value (`rig/config/models.py`).
+`rig/cli/command.py` makes an option of each field. Each field says what None means; for settings that a config has too,
+None means the config's value (`rig/config/models.py`).
 """
 
 import inspect

@@ -23,8 +23,8 @@ _LEAST_URGENT = 19
 class RowWorkers:
     """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its core's cache.
 
-    `post` queues work: each thread does its part in order and none waits for the others. If work fails, the next call
-    raises its error, and no further work is begun until then. With one thread, `post` does the work itself, at once.
+    `post` queues work: each thread does its part in order and none waits for the others. If work fails, all that has
+    not begun is dropped, and the next call raises the error. With one thread, `post` does the work itself, at once.
     The threads end with `close`, or when nothing refers to the workers any more.
     """
 
@@ -69,7 +69,7 @@ class RowWorkers:
             raise error
 
     def close(self) -> None:
-        """End the threads once all work is done."""
+        """End the threads once all queued work is done, without waiting for it. Post nothing afterwards."""
         self._ended()
 
     def __enter__(self) -> Self:
@@ -89,7 +89,7 @@ class _State:
         self.done = [0] * threads
         self.posted = 0
         self.wanted = 0
-        """Number of posts that must be done before the caller, who waits, goes on."""
+        """Number of posts that must be done before the waiting caller goes on."""
         self.changed = threading.Condition()
         self.error: BaseException | None = None
         """The first failure. It is kept until all posted work is over and the caller has received it."""
@@ -98,7 +98,7 @@ class _State:
 def yield_to_others() -> None:
     """Give the calling thread the lowest priority: it hardly works while no core is idle. Does nothing except on Linux.
 
-    Every map waits for the slowest row thread, so less urgent work on one row thread's core would delay all.
+    Every map waits for the slowest row thread, so less urgent work on the core of one of them would delay the map.
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LEAST_URGENT)
@@ -142,7 +142,7 @@ class StageThread:
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread's end; False if it does not come in time."""
+        """Wait for the thread's end. Returns False if it does not come in time, True if the thread was not started."""
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()

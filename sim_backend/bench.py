@@ -1,8 +1,8 @@
-"""The bench that the simulated devices share: one clock, one mirror, one laser, one gate line.
+"""The bench: the state that the simulated devices share, which is one clock, one mirror, one laser and one gate line.
 
 light(t) = emission AND gate. The mirror is where its command was one lag earlier. Devices tell the bench what they do;
-the SPAD asks it what happened during its frames. Methods act at the clock's present time and do not change frames made
-before. Thread-safe.
+the SPAD asks the bench what happened during its frames. Methods act at the clock's present time and do not change
+frames made before. Thread-safe.
 """
 
 import threading
@@ -27,8 +27,8 @@ class BenchState:
     mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
     if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
     the exposure. backward: (n,) bool, level of the direction signal at the frame's start. line_s, scan_s: times of the
-    markers' rising edges in these frames. power_w: laser power that an open gate lets out, 0 if the laser is off.
-    jitter: (n,) or 0, deviation of the mirror from `mirror`.
+    rising edges of the line and scan markers in these frames. power_w: laser power that an open gate lets out, 0 if the
+    laser is off. jitter: (n,) or 0, deviation of the mirror from `mirror`.
     """
 
     mirror: Array
@@ -89,7 +89,7 @@ class Bench:
             return float(self._motion.mirror(np.array([self.now_s()]))[0])
 
     def emit(self, power_w: float) -> None:
-        """Set the laser's power in W behind an open gate; 0 means no emission."""
+        """Set the laser power in W that an open gate lets out; 0 means no emission."""
         with self._lock:
             self._power_w = power_w
 
@@ -126,7 +126,8 @@ class Bench:
             return SyncStatus("waiting" if self._program.waiting else "running", word)
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> BenchState:
-        """State during frames that start at start_s (n,), ascending, at intervals of period_s."""
+        """State during frames that start at start_s (n,), ascending, about period_s apart. The waveform and the laser
+        power are the present ones."""
         until_s = float(start_s[-1]) + period_s
         with self._lock:
             motion = self._motion

@@ -10,10 +10,10 @@ better bound in the dark. The first bound is used for pixels with D < m, the sec
 
 Both bounds grow with power and exposure, so a plan for the largest power and exposure of a column holds for all smaller
 ones. For light that does not depend on the laser, the bound assumes that the laser is off and uses the worst row. The
-laser's effects are evaluated on sampled columns and rows that have a stripe, with all other effects present; the bound
-is twice the mean. If an effect's catalogue entry has a closed form that is small enough, its code is not even loaded.
-The smallest effects are left out first, as long as all that is left out together changes at most `MOST_CHANGED` of the
-decisions.
+laser's effects are evaluated on sampled columns and rows that have a stripe (on all if none has), with all other
+effects present; the bound is twice the mean. If an effect's catalogue entry has a closed form that is small enough, its
+code is not even loaded. The smallest effects are left out first, as long as all that is left out together changes at
+most `MOST_CHANGED` of the decisions.
 
 [1] A. B. Tsybakov, "Introduction to nonparametric estimation", Springer 2009, section 2.4.
 """
@@ -34,7 +34,7 @@ Wanted = Literal["planned", "all"] | tuple[str, ...]
 """The effects to run, of those that a scene calls for: "planned" (all but negligible ones), "all", or those named."""
 
 MOST_CHANGED = 0.01
-"""Largest share of decisions that all left-out effects together may change; it means eps = 2e-4."""
+"""Largest share of decisions that all left-out effects together may change; 0.01 corresponds to eps = 2e-4."""
 MOST = PlannedFor(power_w=1.0, exposure_s=1e-3, exposures=100)
 """Values to plan for if it is not known what will be scanned; a line laser and an ordinary scan stay below them."""
 SAFETY = 2.0
@@ -44,9 +44,8 @@ SAMPLED_COLUMNS, SAMPLED_BANDS, BAND_ROWS = 16, 4, 8
 
 @dataclass(frozen=True, slots=True)
 class EffectDecision:
-    """Whether an effect is run, and why. changes: the largest share of decisions that can differ without it, at most 1,
-    if known.
-    """
+    """Whether an effect is run, and why. changes: the largest share of decisions that can differ without it, at most 1;
+    None: unknown."""
 
     entry: Entry
     on: bool
@@ -56,7 +55,7 @@ class EffectDecision:
 
 @dataclass(frozen=True, slots=True)
 class EffectPlan:
-    """The decision on every effect of the catalogue. changes: the bound for all effects together that are left out."""
+    """The decision on every effect of the catalogue. changes: bound for all those left out as negligible, together."""
 
     planned_for: PlannedFor
     decisions: tuple[EffectDecision, ...]
@@ -125,7 +124,7 @@ def _largest_set(
 
 
 class _Bounds:
-    """Bounds how many decisions change if effects are left out of a model, by evaluating the model's light."""
+    """Finds bounds on how many decisions change if effects are left out of a model, by evaluating its light."""
 
     def __init__(self, model: FluxModel, planes: Array, planned_for: PlannedFor) -> None:
         self._model = model
@@ -142,7 +141,7 @@ class _Bounds:
         self._whole = self._sampled(()) if light else np.zeros(0)
 
     def changes(self, names: Collection[str]) -> float:
-        """Largest share of decisions that differ without these effects; may exceed 1."""
+        """Bound on the share of decisions that differ without these effects; may exceed 1."""
         model = self._model
         dark = [model.steady[name] for name in names if name in model.steady]
         rest = self._seconds * model.without(names).steady_per_s
@@ -156,7 +155,7 @@ class _Bounds:
         return found
 
     def _sampled(self, without: Collection[str]) -> Array:
-        """Detections per second and watt, (columns, sampled rows, width), without some effects."""
+        """Laser light, detections per second and watt (columns, sampled rows, width), without some effects."""
         model = self._model.without(without)
         rate = np.zeros_like(model.steady_per_s)
         found = []
@@ -169,18 +168,16 @@ class _Bounds:
 
 
 def _changed(change: Array, least: Array) -> Array:
-    """The module's bound for each row (...). change, least: D and the smaller number of photons with and without the
-    effects, in a column's frames, both (..., width).
-    """
+    """The module's bound for each row (...). change: D; least: the smaller of the numbers of photons with and without
+    the effects. Both are (..., width), for all of a column's frames."""
     small = change < least
     spread = np.divide(change * change, least, out=np.zeros_like(change), where=small)
     return np.asarray(0.5 * np.sqrt(spread.sum(axis=-1)) + np.where(small, 0.0, change).sum(axis=-1))
 
 
 def _bands(rows: int) -> list[tuple[int, int]]:
-    """The bands of rows that are sampled, spread over the picture: first row, and that after the last. A small picture
-    is one band.
-    """
+    """The bands of rows that are sampled, spread over the picture: (first row, row after the last). A small picture is
+    one band."""
     if rows <= SAMPLED_BANDS * BAND_ROWS:
         return [(0, rows)]
     middles = (np.arange(SAMPLED_BANDS) + 0.5) * rows / SAMPLED_BANDS

@@ -2,7 +2,7 @@
 
 An effect's light is the flux with it minus the flux of the effects before it, so the effects' lights add up to the
 flux. Costs are medians of one thread's time, measured on request: light per column, divided among the frames that share
-it; effects on bits per whole frame. Light that does not depend on the laser is computed only once.
+it; effects on bits per whole frame. Light that does not depend on the laser is computed only once; its cost is 0.
 """
 
 import time
@@ -59,9 +59,8 @@ def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float
 def flux_row(
     world: "SimulatedWorld", row: int, command: float, power_w: float, exposure_s: float
 ) -> Mapping[str, Array]:
-    """Detections per exposure along a row (width,), from each effect that adds light or dark counts; zeros for effects
-    that are off.
-    """
+    """Detections per exposure along a row, (width,) for each effect on light and for the dark counts; zeros for effects
+    that are off. Effects on bits are left out."""
     model, view, limits = world.flux_model, world.setting.view, world.model.scanner.command_range
     (sheets,) = world.fan.sheets(world.model.sheets, np.array([command]), view.rows, [0.0], limits)
     lit: dict[str, Array] = {}
@@ -121,9 +120,8 @@ def _took_s(work: Callable[[], object]) -> float:
 def _parts(
     model: FluxModel, sheet: LightSheet, first_row: int, last_row: int, kind: type[np.floating[Any]] = np.float64
 ) -> dict[str, tuple[Array, float]]:
-    """The light that each effect of the laser adds, detections per second and watt (their rows, width), and the seconds
-    it took.
-    """
+    """For each effect on the laser's light: what it adds to rows first_row..last_row-1, in detections per second and
+    watt (rows, width), and the seconds that this took."""
     rate: Any = np.zeros(model.steady_per_s.shape, kind)
     parts = {}
     for name, effect in model.laser.items():

@@ -1,4 +1,4 @@
-"""The simulated pattern generator's outputs over time: a program of words that the scan marker triggers."""
+"""The simulated pattern generator's outputs over time: a program of words, some of which wait for the scan marker."""
 
 import math
 from bisect import bisect_right
@@ -38,7 +38,7 @@ class OutputLevels:
 
 
 class GateProgram:
-    """One run of a program from `start_s`. Output levels are known up to the time to which it was advanced.
+    """One run of a program from `start_s` on. Output levels are known up to the time to which it was advanced.
 
     A word without duration waits while the scan marker is low. After the last repeat all outputs are low.
     """
@@ -64,7 +64,7 @@ class GateProgram:
         return not self.ended and self._pulses[self._index].duration_s is None
 
     def advance(self, until_s: float, trigger: Trigger) -> None:
-        """Play on up to `until_s`."""
+        """Play on up to `until_s`, that instant excluded."""
         while not self.ended:
             duration_s = self._pulses[self._index].duration_s
             if duration_s is None:

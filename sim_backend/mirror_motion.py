@@ -1,8 +1,8 @@
 """The motion of the simulated mirror and the levels of the scanner's marker outputs, at any time.
 
 The command has the value of point i at the start of point i and goes linearly to the next one. The mirror lags
-behind the command by a time that depends on its direction of motion. Marker outputs have no lag. A real mirror also
-shakes. Times are seconds of the bench.
+behind the command by a time that depends on its direction of motion. Marker outputs have no lag. The mirror can also
+shake (`Jitter`). Times are those of `Bench.now_s`.
 """
 
 import math
@@ -47,9 +47,8 @@ class Jitter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playing:
-    """A waveform that is played from `start_s` at `rate_hz` (the true rate, clock error included), then rests at its
-    last point.
-    """
+    """A waveform that is played `repeats` times from `start_s` on, at `rate_hz` (the true rate, clock error included).
+    The command stands at the first point before and at the last point afterwards."""
 
     waveform: ScanWaveform
     repeats: int

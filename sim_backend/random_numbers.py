@@ -2,11 +2,11 @@
 
 Random bits are counters enciphered by rounds of AES, for which processors have instructions. Counter-based numbers need
 no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
-`counter_bits` is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (the last one
-mixes columns like the others, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word`
+`counter_bits` is their ARS-5, which passes BigCrush there: five rounds whose keys step by a Weyl sequence (here the
+last one mixes columns too, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word`
 enciphers the numbers of blocks of 8 pixels with three more rounds. Block numbers of one key differ in a few bytes,
 which two rounds spread over all 16; after the third, bytes of two blocks agree as often as by chance, within 1e-7.
-Single numbers that follow from a seed and a place use SplitMix64 (Steele, Lea, Flood 2014).
+Single numbers that follow from a seed and a count use SplitMix64 (Steele, Lea, Flood 2014).
 
 One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere table look-ups
 give the same bits, many times as slowly.
@@ -190,7 +190,7 @@ def block_numbers(words: int) -> NDArray[np.uint64]:
 
 @_intrinsic
 def drawn_word(typing: Any, key: Any, blocks: Any, levels: Any) -> _Code:
-    """drawn_word(key, blocks, levels): bits of 64 pixels, each 1 if its 16 random bits are above its level.
+    """drawn_word(key, blocks, levels): bits of 64 pixels, each 1 if its 16 random bits, as int16, exceed its level.
 
     key: two uint64. blocks: address of the word's `block_numbers`. levels: address of 64 int16 in the order `PLACE`,
     each 32767 minus 65536 times a probability.
@@ -263,7 +263,7 @@ mixed_word = numba.njit(cache=True, nogil=True, inline="always")(mixed)
 
 @numba.njit(cache=True, nogil=True)
 def frame_key(seed: np.uint64, frame: np.uint64) -> np.uint64:
-    """Start of a frame's random stream."""
+    """64 random bits that the seed and a frame's number determine: the start of the frame's random stream."""
     return np.uint64(mixed_word(mixed_word(seed + GOLDEN) + frame * FRAME_STEP))
 
 

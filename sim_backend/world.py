@@ -1,4 +1,4 @@
-"""The simulated world: a scene in front of a rig, the bench that its devices share, and the truth of a sweep."""
+"""The simulated world: a scene in front of a rig, the `Bench` that its devices share, and the truth of a sweep."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -68,9 +68,8 @@ class WorldConfig(KindConfig):
 
     kind: str = "simulated"
     geometry: str | None = None
-    """Rig-model file of the rig as it really is; the bundled simulated rig by default. If the file has sheets that bow,
-    pass beside the mirror's axis or touch a cone, or rows that are exposed one after the other, this is simulated.
-    """
+    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Its sheets are simulated even if
+    they bow, pass beside the mirror's axis or are tilted towards it (`cone_rad`), and so is its row delay."""
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""
     fog: Annotated[str | None, BeforeValidator(_known_fog)] = None
@@ -81,10 +80,10 @@ class WorldConfig(KindConfig):
     sensor: Sensor = Field(default_factory=Sensor)
     line: Line = Field(default_factory=Line)
     effects: Annotated[Wanted, AfterValidator(_known)] = "planned"
-    """Effects that are simulated, of those that the scene calls for: all but those that provably change next to nothing
-    (`planned`), `all`, or a list of names (for ablations)."""
+    """Effects that are simulated, of those that the scene calls for. `planned`: all but those that provably change next
+    to nothing; `all`; or a list of names (for ablations)."""
     command_grid: CommandGridConfig | None = None
-    """Columns within which the flux is held constant, if no application calls `hold_columns`."""
+    """Columns whose frames get the light of one mirror position; `hold_columns` replaces them. None: finer cells."""
 
     @property
     def has_board(self) -> bool:
@@ -93,11 +92,11 @@ class WorldConfig(KindConfig):
 
 
 MOST_VIEWS, TIME_STEP_S = 64, 1e-3
-"""The truth of a moving scene is put together from at most so many moments of a sweep, at least this far apart."""
+"""A moving scene's truth is put together from about `MOST_VIEWS` moments at most, at least `TIME_STEP_S` apart."""
 
 
 class SimulatedWorld:
-    """One scene, one rig, one bench. Reading is safe from any thread."""
+    """One scene, one rig, and the `Bench` of its devices. Reading is safe from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
         """Raises DeviceError if the geometry, the scene, its board's pose or the focus cannot be used."""
@@ -136,7 +135,7 @@ class SimulatedWorld:
         self.fan: LineFan = ONE_LINE
         """The lines that leave the mirror together."""
         self.grid = fine_grid(camera.width, self.model.scanner.command_range)
-        """Cells of mirror positions; frames in one cell share one flux."""
+        """Cells of mirror positions. Frames in one cell get the light of one position, jitter apart."""
         if config.command_grid is not None:
             grid = config.command_grid
             self.hold_columns(np.linspace(grid.first, grid.last, grid.columns))
@@ -155,12 +154,12 @@ class SimulatedWorld:
 
     @property
     def effect_plan(self) -> EffectPlan:
-        """The effects that are simulated and why. Decided when first asked for, after the devices have been made."""
+        """Which effects are simulated, and why. Decided by `plan_for` or at first use, once the devices are made."""
         return self._plan()[0]
 
     @property
     def flux_model(self) -> FluxModel:
-        """The light of the effects that are simulated."""
+        """The effects that are simulated: their light, counts and changes of bits."""
         return self._plan()[1]
 
     def _plan(self) -> tuple[EffectPlan, FluxModel]:
@@ -183,22 +182,21 @@ class SimulatedWorld:
         """Project several lines, each at one of these offsets (in units of the mirror command) from where a single line
         would be.
 
-        shared: whether they share the laser's power; else each has all of it. Call it before `plan_for` and before
-        the SPAD is configured.
+        shared: whether the lines share the laser's power; if not, each has all of it. Call this method before
+        `plan_for` and before the SPAD is configured.
         """
         self.fan = LineFan(tuple(offsets), 1 / len(offsets) if shared else 1.0)
 
     def hold_columns(self, commands: Array) -> None:
-        """Hold the flux constant within columns at these mirror commands (columns,): a pixel has the same detection
-        probability in all frames of a column.
+        """Treat the mirror as held within columns at these mirror commands (columns,): all frames of a column get the
+        light of one position, jitter apart.
 
-        Call it before the run. Otherwise the stripe moves within a column in steps of about a quarter of a pixel.
+        Call it before the run. Without it and `command_grid`, the stripe moves in steps of about a quarter of a pixel.
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
     def cover_lens(self) -> None:
-        """Let no more light in. Only the sensor's own counts are left, and none of its effects is left out, however
-        small.
+        """Let no more light in. Dark counts and effects on bits remain if the config wants them, even if negligible.
 
         Call it before the SPAD is configured. A later `plan_for` with other values undoes it.
         """
@@ -207,8 +205,8 @@ class SimulatedWorld:
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
     def mirror_positions(self, state: BenchState, period_s: float) -> Array:
-        """Mirror positions (n,) that set the light of n frames, one period apart: the mean position within the frame's
-        cell of `grid`, plus the mirror's jitter.
+        """Mirror positions (n,) whose light the n frames of `state` get: for each frame the mean position of all frames
+        in its cell of `grid`, plus its own jitter, limited to the command range. period_s: from frame to frame.
 
         If rows are exposed one after the other, (n, 2) for the first and the last row. NaN outside the grid.
         """
@@ -229,10 +227,10 @@ class SimulatedWorld:
         return self.model
 
     def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: Array | None = None) -> SweepTruth:
-        """The true position of the stripe for each column (commands (columns,)), and the depth of every pixel.
+        """The true position of a single line's stripe for each column, and the depth of every pixel.
 
-        velocity_per_s: of the command. time_s: (columns,), as in the interface. If surfaces move, a column's truth is
-        that of its own time, and a pixel's depth that of the time at which the line passed the pixel.
+        Arguments as in `World.truth`. If surfaces move, a column's stripe is that of the column's time, and a pixel's
+        depth that of the time at which the line passed the pixel.
         """
         first = np.asarray(commands, dtype=np.float64)
         held = np.stack([first, first + velocity_per_s * self._frame_delay_s], axis=-1)
@@ -259,13 +257,14 @@ class SimulatedWorld:
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
-        """Mean detections per exposure along an image row, for each effect that adds light or counts, at a command."""
+        """Mean detections per exposure along an image row at a mirror command: (width,) for each effect on light and
+        for dark counts. Effects on bits (hot and dead pixels, crosstalk, afterpulsing, ...) are left out."""
         from sim_backend.effects_report import flux_row
 
         return flux_row(self, row, command, power_w, exposure_s)
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
-        """A source of frames that follow one another at these times."""
+        """A source of frames with this timing. threads: most threads that it uses."""
         model = self.model
         return PhotonSource(self.flux_model, model.sheets, times, seed, threads, self.fan, model.scanner.command_range)
 
@@ -281,16 +280,17 @@ def _own(model: RigModel) -> dict[str, str]:
 
 
 def _in_steps(time_s: Array) -> Array:
-    """Times (n,) rounded to at most MOST_VIEWS values: each takes a view of its own where surfaces move."""
+    """Times (n,) rounded down to at most MOST_VIEWS + 1 values, since each value needs a view of its own."""
     low, high = float(np.nanmin(time_s)), float(np.nanmax(time_s))
     step_s = max((high - low) / MOST_VIEWS, TIME_STEP_S)
     return low + np.floor((time_s - low) / step_s) * step_s
 
 
 def surface_passed(still: CameraView, x_px: NDArray[np.float32], at_s: Array) -> Array:
-    """Inverse depth (rows, width) of every pixel of moving surfaces at the time at which the line passed it.
+    """Inverse depth (rows, width) that every pixel saw when the line passed it. still: the view at time 0.
 
-    x_px: (rows, columns), the stripe; at_s: (columns,). Pixels between stripes have the time of the nearest one.
+    x_px: (rows, columns), the stripe; at_s: (columns,), times of the bench. A pixel between stripes has the time of the
+    nearest one, and a row without stripes the median time.
     """
     pixels = np.arange(still.width)
     passed_s = np.full((still.rows, still.width), float(np.median(at_s)))
@@ -326,13 +326,13 @@ def _load_geometry(path: Path) -> RigModel:
 
 
 def bench_of(surroundings: Surroundings) -> Bench:
-    """The shared bench. Without a simulated world, a new bench, for a single simulated device among real ones."""
+    """The simulated world's `Bench`. Without such a world, a new one for a simulated device among real ones."""
     world = surroundings.world
     return world.bench if isinstance(world, SimulatedWorld) else Bench(surroundings.clock, Lag())
 
 
 def note_effect(surroundings: Surroundings, effect: str, why: str) -> None:
-    """Tell the world that a device has an effect of its own, namely one of kind `within` in the catalogue, and why."""
+    """Tell a simulated world that a device has an effect, of kind `within` in the catalogue, and why."""
     if isinstance(surroundings.world, SimulatedWorld):
         surroundings.world.setting.devices[effect] = why
 

@@ -32,7 +32,7 @@ _LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
 
 
 def _metres(text: object) -> float:
-    """The length in metres of a text such as '60 mm'. Raises ValueError for a number without a unit."""
+    """The length in metres of a text such as '60 mm'. Raises ValueError for anything else, such as '60'."""
     match = _LENGTH.fullmatch(text.strip()) if isinstance(text, str) else None
     if match is None or match[2] not in _METRES:
         raise ValueError(f"{text!r} is no length; write it with a unit ({', '.join(_METRES)}), like '60 mm'")
@@ -74,7 +74,7 @@ class Board:
 
     dictionary: the name of an OpenCV dictionary, such as DICT_5X5_100. modules: the cells of all markers, (squares
     down, across, side, side), True where black, the marker's border included; squares without a marker are False. side:
-    modules along a marker, 0 for a chessboard. Raises CalibrationError for a board that cannot be printed.
+    modules along a marker, 0 for a chessboard. Raises CalibrationError for values that describe no usable board.
     """
 
     kind: Literal["charuco", "chessboard"]
@@ -85,7 +85,7 @@ class Board:
     modules: NDArray[np.bool_] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the numbers and draw the squares."""
+        """Check the values and draw the markers."""
         if not all(_FEWEST_SQUARES <= count <= _MOST_SQUARES for count in self.squares):
             raise CalibrationError(
                 f"board has {self.squares[0]} x {self.squares[1]} squares; each side takes {_FEWEST_SQUARES} to "
@@ -139,7 +139,7 @@ class Board:
         return np.where(paper, np.where(inside & black, BLACK, WHITE), np.nan)
 
     def picture(self, px_per_square: int) -> NDArray[np.uint8]:
-        """The board with its white margin as a picture for printing, 0 for black and 255 for white."""
+        """The board with its white margin as a picture (height, width) for printing, 0 for black and 255 for white."""
         side = 1 + 2 * MARGIN_SQUARES / np.array(self.squares)
         width, height = (np.round(side * self.squares * px_per_square)).astype(int)
         x, y = (((np.arange(n) + 0.5) / px_per_square - MARGIN_SQUARES) * self.square_m for n in (width, height))
@@ -166,7 +166,7 @@ class Board:
         return np.asarray(black | (in_marker & self.modules[row, column, j, i]))
 
     def _drawn_modules(self) -> NDArray[np.bool_]:
-        """The markers, one in every white square, row by row."""
+        """`modules`: a marker in every white square, row by row. Raises CalibrationError for too small a dictionary."""
         across, down = self.squares
         if self.dictionary is None:
             return np.zeros((down, across, 0, 0), np.bool_)
@@ -187,9 +187,7 @@ class Board:
 
 
 def load_board(path: str | os.PathLike[str] | None = None) -> Board:
-    """Read a board from a YAML file. path None: the bundled board. Raises CalibrationError if the file describes no
-    board.
-    """
+    """Read a board from a YAML file (None: the bundled one). Raises CalibrationError if it is unreadable or invalid."""
     file = BUNDLED_BOARD if path is None else Path(path)
     read = load_yaml(file, "a board", "kind: charuco")
     parsed = validated(BoardFile, read.content, ValueSources(str(file), read.lines))

@@ -47,8 +47,8 @@ _MOST = 100
 class Lattice:
     """Corners of a chessboard as far as they are visible.
 
-    px: (down, across, 2) raw pixels. beyond: for its upper, right, lower and left side, the change of light in the next
-    row of squares as a share of the usual one; NaN where the picture does not show it.
+    px: (down, across, 2) raw pixels. beyond: for its upper, right, lower and left side, the change of brightness at the
+    next row of corners, on that row's outer side, as a share of the usual one; NaN if the picture does not show it.
     """
 
     px: Array
@@ -90,10 +90,10 @@ def known_lattice(picture: Picture, px: Array) -> Lattice | None:
 class _Seen:
     """Light around the corners of a grid.
 
-    map: maps positions in squares, from the outer corner of the top left square, to pixels. usual: usual change of
-    brightness at a corner, positive if the top left square is black. alike: share of the corners that have such a
-    change. own: change on the outer side of the uppermost row, as a share of the usual one; NaN where it is not
-    visible.
+    map: maps positions in squares, from the outer corner of the top left square, to pixels. usual: median change of
+    brightness at a corner, positive if the top left square is black. alike: share of the changes seen, above and below
+    corners, that are like it. own: change on the outer side of the uppermost row, as a share of the usual one; NaN if
+    not visible.
     """
 
     map: BoardMap
@@ -103,7 +103,7 @@ class _Seen:
 
 
 def _cut_down(picture: Picture, px: Array) -> Array | None:
-    """The grid without outer rows that are not there; None if fewer than two rows or columns are left."""
+    """The grid without outer rows and columns that are not real; None if fewer than two of either are left."""
     while min(px.shape[:2]) >= _FEWEST:
         sides = [_seen(picture, np.rot90(px, turn)) for turn in range(4)]
         own = [np.inf if side is None or not np.isfinite(side.own) else side.own for side in sides]
@@ -115,7 +115,7 @@ def _cut_down(picture: Picture, px: Array) -> Array | None:
 
 
 def _grown(picture: Picture, px: Array) -> Array:
-    """The grid, extended on all sides by the rows of corners that follow."""
+    """The grid, extended on all sides by the rows of corners that follow, up to _MOST corners along a side."""
     turn = kept = 0
     while kept < 4 and max(px.shape[:2]) < _MOST:
         turned = np.rot90(px, turn)
@@ -146,7 +146,7 @@ def _seen(picture: Picture, px: Array) -> _Seen | None:
 
 
 def _seen_beyond(picture: Picture, px: Array) -> float:
-    """The change at the next row of corners above the grid, as a share of the usual one; NaN if not seen."""
+    """The change at the next row of corners above the grid, on its upper side, as a share of the usual one, or NaN."""
     seen = _seen(picture, px)
     if seen is None:
         return np.nan
@@ -171,7 +171,7 @@ def _change(picture: Picture, board_map: BoardMap, x: NDArray[np.integer], y: ND
 
 def _row_above(picture: Picture, px: Array) -> Array | None:
     """(across, 2) corners above the uppermost row. A corner that is not found is put at its expected place; None if
-    most are not found.
+    most are not found or no smooth map fits.
     """
     seen = _seen(picture, px)
     if seen is None:
@@ -215,16 +215,16 @@ def _median(values: Array) -> float:
 
 
 _SMALLEST_PARTS = ((4, 4), (3, 3))
-"""Inner corners of a chessboard that count as a part of one; small ones are more often found where there is no
-board."""
+"""Fewest inner corners of a part of a chessboard, tried in turn; smaller grids are often found where no board is."""
 _FORMS_FOR_PARTS = ((1, 0.0), (1, 1.5), (2, 0.8))
 """(enlargement, smoothing), as in FORMS; few and quick ones, since they are tried after all of FORMS have failed."""
 _NOTHING = MatchedPoints(np.zeros((0, 2)), np.zeros((0, 2)), 0)
 
 
 def find_chessboard(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's inner corners, from its top left if the print shows which corner that is. If only a part of it or
-    another chessboard is seen, there are no points, and `part` or `other` says so.
+    """The board's inner corners, from its top left if the print shows which corner that is. If only a part of it or a
+    chessboard of another size is seen, there are no points, and `part` or `other` says so. If the corner squares are
+    white, there are points, and `other` says so. If nothing is found, there are no points either.
     """
     seen: Lattice | None = None
     for form in FORMS:
@@ -270,7 +270,7 @@ def _part(shown: Gray, form: tuple[int, float], smallest: tuple[int, int]) -> Ar
 
 
 def _found(lattice: Lattice, shown: Gray, board: Board, form: tuple[int, float]) -> MatchedPoints:
-    """The whole board, and whether the rest of the picture shows another one like it."""
+    """The points of the whole board; `chessboards` is 2 if the rest of the picture shows another one like it."""
     px = lattice.px if lattice.grid == board.grid else lattice.px.transpose(1, 0, 2)
     px, mirrored = _from_top_left(px, shown, board)
     points = board.corners_m[:, :2]

@@ -1,7 +1,7 @@
-"""Finds a board's corners in a noisy picture of flux, from summed counts, or in an image file.
+"""Finds a board's corners in a noisy picture, which shows the flux from summed counts or comes from an image file.
 
 Unusable pixels are first filled in from their neighbours. OpenCV looks for the markers, or the chessboard, in the
-picture as it is, enlarged and smoothed, and the version that shows most is used. A smooth map through what it found
+picture as it is, then in enlarged and smoothed versions, until one shows enough. A smooth map through what it found
 gives the places of all corners, and each corner is then fitted on its own (registration.py). A picture that cannot be
 used is refused with the reason: no board, the wrong board, half of one, its mirror image, or two boards.
 """
@@ -24,7 +24,7 @@ _REACHES = (1, 2, 4)
 
 
 def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-    """The picture with defects (True) and non-finite values replaced by the median of usable neighbours, 0 if none."""
+    """The picture with defects (True) and non-finite values replaced by the median of usable pixels nearby, or by 0."""
     values: NDArray[np.float32] = np.array(picture, dtype=np.float32)
     bad = ~np.isfinite(values)
     if defects is not None:
@@ -45,7 +45,7 @@ def repaired(picture: NDArray[np.generic], defects: NDArray[np.bool_] | None = N
 LEAST_SHARE = 0.5
 """A view must show more than this share of the board's corners."""
 _SECOND_BOARD_MARKERS = 4
-"""Fewest markers off the board that count as a second board: so many are not misread in a consistent way."""
+"""Fewest markers off the board that count as a second board: so many would not be misread alike."""
 _MAP_OUTLIER_SQUARES = 0.4
 """Largest distance of a point from the homography, in squares. Lenses bend a board by less; misread markers are farther
 off."""
@@ -110,8 +110,8 @@ def _another(sighting: MatchedPoints, rest: NDArray[np.bool_], limit_px: float, 
 def _refined(
     values: NDArray[np.float32], board: Board, rough: BoardMap, sighting: MatchedPoints
 ) -> tuple[NDArray[np.int32], Array, Array]:
-    """Find all corners: first close to the rough map, then farther out with maps through the corners found so far, and
-    last each on pixels that no other corner uses.
+    """Ids, pixels and sds of all corners found: first those close to the points of `sighting`, then those farther out,
+    with maps through the corners found so far, and last each on the pixels nearest to it. Empty if no map fits.
     """
     corners_m = board.corners_m[:, :2]
     side = sides_px(board, rough, np.array([board.size_m]) / 2)[0]

@@ -20,9 +20,9 @@ from calibration.board.board import Board
 Places = NDArray[np.int64]
 
 _NEXT_SQUARES = 2.5
-"""Largest distance in squares from a placed marker to the next; doubled once several are placed. Neighbours: 1.4."""
+"""Most columns or rows from a placed marker to the next; doubled once _FOR_HOMOGRAPHY are placed. Neighbours: 1."""
 _OFF_SQUARES = 0.3
-"""Largest distance of a marker of this lattice from the middle of a square."""
+"""Largest distance, along a row or column, of a marker of the lattice from the middle of a square."""
 _MOST_TURN_RAD = 0.6
 _FOR_HOMOGRAPHY = 4
 _MOST_ACROSS = 40
@@ -48,7 +48,7 @@ class Markers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """An order of ids. across: squares along a row. white_first: whether the top left square is white."""
+    """An order of ids from first_id on. across: squares along a row. white_first: whether its top left one is white."""
 
     across: int
     white_first: bool = False
@@ -121,7 +121,7 @@ def _named(layout: _Layout, ids: Places, board: Board) -> str:
 
 
 def _support(layout: _Layout, ids: Places, lattice: Places) -> tuple[int, Places]:
-    """The number of markers that stand where a layout has them, and the place of its top left square on the lattice."""
+    """The number of markers that stand where the layout has them, and the lattice's place of its top left square."""
     if len(ids) == 0:
         return 0, np.zeros(2, np.int64)
     origins, counts = np.unique(lattice - layout.places(ids), axis=0, return_counts=True)
@@ -165,7 +165,7 @@ def _grown(px: Array, start: int, marker_squares: float) -> tuple[NDArray[np.boo
 
 
 def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array | None:
-    """Map (3, 3) from pixels to squares, with the first one's middle at (0, 0); None if the markers determine none.
+    """Map (3, 3) from pixels to squares; (0, 0) is the middle of the square at place (0, 0). None if there is none.
 
     For few markers it is affine: the errors of an affine map grow less with distance than those of a homography.
     """
@@ -183,7 +183,7 @@ def _map_to_lattice(places: Places, px: Array, marker_squares: float) -> Array |
 
 
 def _ends_early(board: Board, shown: NDArray[np.uint8], px: Array, places: Places) -> str | None:
-    """Say that the print has white paper below its last markers, where the board has black squares; None otherwise."""
+    """Say that white paper is visible below the print's last markers, where the board has black squares; else None."""
     across, down = board.squares
     assert board.marker_m is not None, "asked of boards with markers"
     to_lattice = _map_to_lattice(places, px, board.marker_m / board.square_m)
@@ -227,10 +227,10 @@ _DARKEST, _BRIGHTEST = 0.5, 99.5
 class MatchedPoints:
     """Points of the board (n, 2) in metres and their places in the picture, (n, 2) raw pixels, to about half a pixel.
 
-    count: number of markers or corners read. mirrored: whether only the picture's mirror image shows the board.
-    chessboards: number of chessboards in the picture. part: corners along (x, y) of what may be a part of
-    the chessboard. other: how the visible chessboard differs from the board. markers: all that were read, the board's
-    and others.
+    count: number of the board's markers, or of corners, read. mirrored: whether only the picture's mirror image shows
+    the board. chessboards: 2 if another one like the board was seen, else 1. part: corners along (x, y) of what may be
+    a part of the chessboard, or None. other: how the visible chessboard differs from the board, or None. markers: all
+    that were read, the board's and others; None for a chessboard or a mirror image.
     """
 
     points_m: Array
@@ -243,7 +243,7 @@ class MatchedPoints:
     markers: Markers | None = None
 
     def square_px(self, board: Board) -> float:
-        """Side of a square in pixels, from the points' spread."""
+        """Side of a square in pixels, from the points' spread; 1 at least."""
         spread_px = np.sqrt(np.prod(np.std(self.px, axis=0)))
         return float(max(spread_px / np.sqrt(np.prod(np.std(self.points_m, axis=0))) * board.square_m, 1.0))
 
@@ -256,8 +256,8 @@ def gray(values: NDArray[np.float32]) -> Gray:
 
 
 def find_markers(shown: Gray, board: Board) -> MatchedPoints:
-    """The board's markers. If few are found, and more than twice as many in the picture's mirror image, the result is
-    that of the mirror image: `mirrored` is set, and `px` are its pixels.
+    """The corners of the board's markers. If few are found, and more than twice as many in the picture's mirror image,
+    the result is that of the mirror image: `mirrored` is set, `px` are its pixels, and `markers` is None.
     """
     best = _most_markers(shown, board)
     if best.count <= 0.25 * len(board.charuco().getIds()):

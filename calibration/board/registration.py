@@ -8,15 +8,16 @@ picture, not on the board. Lens distortion is a polynomial there, whatever the b
 not. Fitting it on the board moves corners by less than 0.002 px, but equally in all pictures, which makes focal lengths
 wrong by 0.025 % at k1 = 0.2.
 
-Around a corner the picture is offset + gain * (1 + slopes) * drawn board, shifted by (dx, dy); the shift that fits best
-tells where the corner is. All edges around it, those of the markers included, contribute, so a picture of few photons
-gives a tenth of the error of cv2.cornerSubPix (docs/how-to/calibration.md). The fit is weighted least squares by
+Around a corner the picture is offset + gain * drawn board, shifted by (dx, dy); the gain may change linearly along x
+and y. The best shift gives the corner. All edges around it contribute, those of markers too. So with few photons the
+error is a tenth of that of cv2.cornerSubPix (docs/how-to/calibration.md). The fit is weighted least squares by
 Gauss-Newton, with a variance proportional to the light, as for photons. Outliers (such as an unlisted hot pixel) do not
 count.
 
-The drawing is bent as the map bends around each corner, and is as fine as the picture it is compared with. A homography
-without the bend, or edges rounded to drawn pixels, would move all corners of a picture alike by some 0.002 px, which no
-number of corners averages out. For the same reason the last fit of each corner chooses its own pixels.
+The drawing is bent as the map bends around each corner, and is up to SUBPIXELS times as fine as the picture. A
+homography without the bend, or edges rounded to drawn pixels, would move all corners of a picture alike by some 0.002
+px, which no number of corners averages out. The last fit of each corner uses only the pixels nearest to it, so corners
+share hardly any.
 """
 
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ class BoardMap:
     """Maps board positions (metres) to raw pixels.
 
     homography: (3, 3) float64, for positions scaled to -1..1 over the board. bend_px: (terms, 2) float64, coefficients
-    of x^i y^j of the homography's result, scaled to -1..1 over the board's picture.
+    of x^i y^j, (x, y) being the homography's result, scaled by centre_px and half_px to -1..1 over the fitted points.
     """
 
     homography: Array
@@ -109,8 +110,8 @@ def fit_map(
 ) -> tuple[BoardMap, NDArray[np.bool_]] | None:
     """The map through points (n, 2) seen at px (n, 2), and which of them it fits; None if no four agree.
 
-    outlier_px: largest distance from the homography. If there is a polynomial, a point fits that is off by at most five
-    times the median distance, or by 0.3 px.
+    outlier_px: largest distance from the homography. With a polynomial, a point fits if it is off by at most five times
+    the median distance, or by 0.3 px if that is more.
     """
     if len(points_m) < _FEWEST_POINTS:
         return None
@@ -153,15 +154,15 @@ def _terms(at: Array, degree: int) -> Array:
 
 
 SUBPIXELS = 12
-"""Samples drawn per pixel and axis before they are averaged over the pixel's area; even. The drawing is as fine, within
-_PX_PER_SQUARE: for squares wider than 21 pixels it is coarser, and interpolated.
+"""Samples per pixel and axis that are averaged over the pixel's area; an even number. The drawing is as fine as these,
+within _PX_PER_SQUARE: for squares wider than 21 pixels it is coarser, and interpolated.
 
 With 6 samples and no noise, corners are off by 0.0020 px, alike enough in all pictures to change focal lengths by 60
 ppm. With 12 they are off by 0.0012 px, most of it from the drawing of the test pictures, and focal lengths by 30 ppm.
 """
 WIDE, OWN = 0.9, 0.5
 """Reach of the patch around a corner, in squares. WIDE, to find the corner: short of the next corners. OWN: halfway to
-the next ones, so that no two corners share pixels and their errors are independent, as a fit assumes."""
+the next ones, so that corners hardly share pixels and their errors are independent, as a fit assumes."""
 _MOST_REACH_PX = 16
 _LEAST_REACH_PX = 4
 _SEARCH_SQUARES = 0.25
@@ -175,7 +176,7 @@ _SETTLED_SDS = 0.1
 """A step shorter than this, in sds of the corner, ends the iteration: the remaining error is a tenth of the step."""
 _OUTLIER_SDS = 5.0
 _DARK_SHARE = 0.05
-"""Least variance of a pixel, as a share of the variance on white."""
+"""Least variance of a pixel, as a share of the difference of light between white and black."""
 _LEAST_MATCH = 0.4
 """Least correlation of picture and drawing. A board under few photons gives 0.5, anything else 0.2."""
 _MOST_SD_PX = 0.5
@@ -187,7 +188,7 @@ in many pictures."""
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
     """A corner's surroundings: its expected pixel, the side of a square and the half width of its patch in pixels, and
-    (4, 4, 2) coefficients of the polynomial from picture to drawing.
+    (4, 4, 2) coefficients of the polynomial from picture to drawing, None if the map there is wrong.
     """
 
     expected_px: Array
@@ -238,7 +239,7 @@ def _places(drawing: Drawing, board_map: BoardMap, ids: NDArray[np.int32], reach
 
 
 def _bent(at: Array, drawn: Array) -> Array | None:
-    """The polynomial from picture to drawing; None if a wrong map squeezes the board into a line."""
+    """The polynomial from picture to drawing; None if a wrong map squeezes the board into a line or is not finite."""
     if not np.isfinite(at).all():
         return None
     i, j = np.array(_POWERS).T
@@ -311,7 +312,7 @@ def _draw(
 def _best_whole_shift(
     picture: NDArray[np.float32], drawing: Drawing, place: _Place, to_drawing: Array, search: int
 ) -> Array | None:
-    """The shift in whole pixels at which picture and drawing correlate best; None if they do not."""
+    """The shift in whole pixels at which picture and drawing correlate best; None if they do not, or at the border."""
     x, y = (round(float(value)) for value in place.expected_px)
     height, width = picture.shape
     reach = min(place.reach, x, y, width - 1 - x, height - 1 - y)

@@ -48,9 +48,9 @@ NOISE_SIGMAS = 4.0
 class SweepWaves:
     """Waves of the sweeps of each view.
 
-    rms: of the waves in command units, without the noise; NaN if there are too few passages. noise: the largest rms
-    that may be noise. command: (BINS,) middles of bins. sweeps: (sweeps, BINS) medians, NaN where there are too few
-    passages.
+    rms: of the waves in command units, without the noise; noise: the largest rms that may be noise; both are NaN if
+    there are too few passages. command: (BINS,) middles of bins. sweeps: (sweeps, BINS) medians of the residuals, NaN
+    where there are too few passages.
     """
 
     rms: float
@@ -101,7 +101,7 @@ def _binned(sweeps: Sequence[SweepFit], edges: Array) -> tuple[Array, Array]:
 
 def _between(left: Array, variance: Array, views: Sequence[Sequence[int]]) -> tuple[float, float]:
     """Mean square of the differences between sweeps of a view without the noise, and its sd if all were noise; NaN if
-    no view has two sweeps.
+    no two sweeps of a view share a bin.
     """
     found = weight = chance = 0.0
     for rows in views:
@@ -142,13 +142,13 @@ _FEWEST_TO_SPLIT = 4
 MOST_MISFIT = 3.0
 """Largest misfit, a factor on the variances, at which the views count as in agreement."""
 MOST_UNEXPLAINED = 0.35
-"""Largest share of the shifts' variance that may remain for a single move to explain them."""
+"""Largest share of the shifts' variance that may remain if a single move is to explain them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
-    """Shift of one view in command units: the median distance of its passages from the light planes, and its sd from
-    the pose's noise."""
+    """Shift of one view in command units: the median distance of its passages from the light planes, with its sign; sd:
+    from the pose's noise."""
 
     name: str
     shift: float
@@ -156,7 +156,7 @@ class ViewShift:
 
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
-    """The shifts of all views of a fit that have passages. views: by name."""
+    """The shifts of all views of a fit that have passages and enough corners. views: by name."""
     shifts = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
         found = _corner_pose(fit, views[name], pose)
@@ -166,8 +166,8 @@ def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
 
 
 def common_shift(shifts: tuple[ViewShift, ...], wave: float, sweeps: int) -> tuple[float, float]:
-    """Root mean square of the differences between views, without the noise of poses and waves, and the largest one that
-    may be such noise; NaN for fewer than two views.
+    """Root mean square of the views' shifts, without the noise of poses and waves, and the largest one that may be such
+    noise; NaN for fewer than two views.
 
     wave: rms of the waves in command units. sweeps: number of sweeps of a view, each with its own wave.
     """
@@ -188,7 +188,7 @@ def counted(shifts: tuple[ViewShift, ...], outliers: tuple[str, ...], misfit: fl
 
 
 def last_before_move(shifts: tuple[ViewShift, ...]) -> str | None:
-    """The view after which the rig moved, if one move between two views explains most of the shifts; else None."""
+    """The view after which the rig moved, if one move explains most of the shifts (in order of time); else None."""
     values = np.array([one.shift for one in shifts])
     if len(values) < _FEWEST_TO_SPLIT:
         return None

@@ -3,9 +3,9 @@
 Each number of the evidence reveals one possible mistake: how many poses there were, how far they were tilted, how large
 the board appeared, how much of the picture it reached, how bright the room was, how long the baseline came out.
 
-A calibration passes if the depth error that its covariance predicts is at most the one asked for, and if its data agree
-with each other and with what is known of the rig. Otherwise the verdict lists reasons. The first one is the most likely
-root cause. Their order is:
+A calibration passes if the depth error that its covariance predicts is at most the one asked for, and if its data are
+enough and agree with each other and with what is known of the rig. Otherwise the verdict lists reasons. The first one
+is the most likely root cause. Their order is:
 
 1. Conditions that make other faults appear: room light that hides the line, boards too far away to be located.
 2. Data that no single rig can have produced (waves, a rig that moved), since no other result can be trusted then.
@@ -63,7 +63,7 @@ class ViewEvidence:
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
     """Evidence from the poses: largest angle between two boards, median distance, median angle that a board's longer
-    side fills.
+    side fills; NaN without poses.
     """
 
     tilt_rad: float
@@ -93,7 +93,7 @@ def view_evidence(
 
 
 def pose_evidence(poses: Sequence[BoardPose], board: Board) -> PoseEvidence:
-    """The evidence from the poses at which a fit found the boards."""
+    """The evidence from the poses that a fit, or `rough_poses`, found."""
     if not poses:
         return PoseEvidence(np.nan, np.nan, np.nan)
     middle = np.array([board.size_m[0] / 2, board.size_m[1] / 2, 0.0])
@@ -145,7 +145,7 @@ _FEWEST_TO_JUDGE = 3
 _MEND_VIEWS = "mend what is said of the other views, then show more"
 _SHOW_ANEW = "show the board again for each of these, at rest until its sweeps are over"
 FEWEST_POSES: Final = 6
-"""Fewest poses that can be checked: with fewer, a bad view bends the fit to it, and nothing shows that it was bad."""
+"""Fewest poses that can be checked: with fewer, a bad view bends the fit to itself, and nothing shows that."""
 FEWEST_WHY: Final = "are the fewest that can be checked against each other"
 
 
@@ -256,7 +256,7 @@ def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[R
 
 
 LEAST_BASELINE_CHANGE: Final = 0.01
-"""Error of a tape measure: 3 mm in 300 mm."""
+"""Least relative change of the baseline that counts: the error of a tape measure, 3 mm in 300 mm."""
 MOST_SHIFT = 0.25
 """Largest contradiction between views, as a share of the accuracy asked for. The fit lies between contradicting views
 already, and its depth is off by several times the remaining contradiction: 2 to 5 times over 30 simulated knocks."""

@@ -239,7 +239,7 @@ def judge_refused(
 ) -> Verdict:
     """Judge views of a picture of `size` (width, height) from which no model could be made.
 
-    photons: as in `data_lack`. line: whether the views should show the line; False if only a camera was asked for.
+    photons: as in `judge_camera`. line: whether the views should show the line; False if only a camera was asked for.
     """
     poses = rules.rough_poses(views, board, rough_camera(size))
     evidence = rules.pose_evidence(poses, board) if poses else None

@@ -24,7 +24,7 @@ _DEFLATE_RATIO: Final = 1032
 
 
 def load_array(file: str | os.PathLike[str]) -> NDArray[Any]:
-    """The array of a .npy file; pickles are refused. Raises OSError; ValueError, with one line, for any other file."""
+    """The array of a .npy file. Raises OSError if it cannot be opened, ValueError (one line) if it holds no array."""
     loaded = _load(Path(file))
     if isinstance(loaded, dict):
         raise ValueError("it is an archive of arrays, not a single one")

@@ -66,7 +66,7 @@ class ValueSources:
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
     def flag(self, key: Key) -> str | None:
-        """The option by which the value of a key was given, if that has a name of its own."""
+        """The option by which the value of a key was given, if that has a name of its own; else None."""
         return self.flags.get(key) if self._is_option(key) else None
 
     def place(self, key: Key) -> str:
@@ -89,7 +89,7 @@ class _Schema:
     kind_of: KindOf
 
     def section(self, path: Key) -> type[BaseModel] | None:
-        """The model that validates the mapping at `path`."""
+        """The model that validates the mapping at `path`; None if there is none."""
         here: type[BaseModel] | None = self.model
         content: Any = self.content
         for part in path:
@@ -102,12 +102,12 @@ class _Schema:
         return here
 
     def of(self, name: str, info: FieldInfo, content: Any) -> type[BaseModel] | None:
-        """The model of a field's content, if it holds mappings."""
+        """The model of a field's content if it holds mappings; else None."""
         models = (kind for kind in plain_types(info.annotation) if issubclass(kind, BaseModel))
         return self.kind_of(name, content) or next(models, None)
 
     def field(self, key: Key) -> FieldInfo | None:
-        """The field at `key`. For an item of a list, the field of the list."""
+        """The field at `key`, None if there is none. For an item of a list, the field of the list."""
         named = _named(key)
         section = self.section(named[:-1])
         return section.model_fields.get(named[-1]) if section is not None and named else None
@@ -135,7 +135,7 @@ def validated(
     """The content as a model. Raises FileError with a line for each problem, in the order of the file.
 
     Stricter than pydantic: true and false are not numbers, and numbers must be finite. kind_of: gives the model of a
-    section whose model depends on its content, from the section's name and content.
+    section whose model depends on its content, from the section's name and content. context: for pydantic's validators.
     """
     schema = _Schema(model, content, kind_of)
     found: dict[Key, list[ErrorDetails]] = {}

@@ -71,7 +71,7 @@ class _CameraFile(sections.FileSection):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera, its covariance, the digests of the views it was made from, and its verdict (None: not judged)."""
+    """A camera, its covariance, digests of the views it was made from, verdict (None: not judged), codes of reasons."""
 
     camera: Camera
     covariance: Covariance
@@ -121,7 +121,7 @@ def camera_file_text(camera: Camera, covariance: Covariance, views: list[str], v
 
 
 def corners_digest(view: View) -> str:
-    """Sixteen hexadecimal digits that identify a view's corners, also if it has none."""
+    """Sixteen hexadecimal digits that identify a view's corners; those for no corners are always the same."""
     digest = hashlib.sha256()
     if view.corners is not None:
         digest.update(np.ascontiguousarray(view.corners.ids, "<i4").tobytes())
@@ -146,8 +146,8 @@ _PLAIN = {"row_delay_s": 0.0, "gate_delay_s": 0.0, "colour_skew_s": 0.0, "marker
 
 
 def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
-    """Read a calibration file, whose paths are relative to its folder. Raises CalibrationError, with one line, if it is
-    invalid.
+    """Read a calibration file, whose paths are relative to its folder. Raises CalibrationError, with one line, if it or
+    a file that it names is unreadable or invalid.
     """
     file = Path(path)
     parsed = _read(file, "a calibration", sections.CalibrationFile)
@@ -158,8 +158,8 @@ def load_rig_model(path: str | os.PathLike[str]) -> RigModel:
 
 
 def save_rig_model(model: RigModel, path: str | os.PathLike[str]) -> None:
-    """Write a model for `load_rig_model`, with its arrays in files beside it. Each file is written completely or not at
-    all. Raises OSError, and CalibrationError for a scanner that is neither a table nor a pivot.
+    """Write a model for `load_rig_model`; defects, dark rate and covariance go into files beside it. Each file is
+    written completely or not at all. Raises OSError, and CalibrationError if the scanner is neither table nor pivot.
     """
     file = Path(path)
     content: dict[str, Any] = {
@@ -255,8 +255,8 @@ _ARRAYS = {
 
 
 def _array(folder: Path, name: str, what: str) -> NDArray[Any]:
-    """The array of a file named in a calibration. Raises CalibrationError for a wrong dtype or shape of planes, and for
-    an unreadable file.
+    """The array of a file named in a calibration. Raises CalibrationError for a wrong dtype, planes of a wrong shape,
+    or an unreadable file.
     """
     file, key = folder / name, "covariance.file" if what == "covariance" else what
     try:

@@ -1,4 +1,4 @@
-"""The sections of a calibration file and their limits, and the only reader of YAML files.
+"""The sections of a calibration file, and the only reader of YAML files.
 
 The reader limits size, depth and repetition. A key may occur only once. Errors are one line.
 """
@@ -208,7 +208,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
 
 
 class _Refused(yaml.YAMLError):
-    """Raised for YAML that this program does not take. The text begins with the line."""
+    """Raised for YAML that this program does not take. The text begins with the line's number."""
 
     def __init__(self, mark: Any, why: str) -> None:
         super().__init__(f"{mark.line + 1}: {why}")
@@ -218,7 +218,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     """Reads YAML, and reports the line of a value that does not fit its tag or form, such as the date 2024-13-45."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """The value of a node."""
+        """The value of a node. Raises _Refused for a value that does not fit and for a whole number too large."""
         try:
             value = super().construct_object(node, deep=deep)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:

@@ -30,7 +30,7 @@ from calibration.arrays import Array, set_frozen
 from calibration.errors import CalibrationError
 
 TERM_COUNTS = (4, 5, 8, 12, 14)
-"""Numbers of distortion terms OpenCV defines."""
+"""Numbers of distortion terms that OpenCV defines, besides none."""
 
 _SEGMENT_SAMPLES = np.linspace(0.0, 1.0, 17)[1:]
 """Places on the segment from the axis to a tangent that are tested for a fold, as shares of it."""
@@ -146,7 +146,8 @@ class LensModel:
             return yv / det, -xv / det, -yu / det, xu / det
 
     def valid(self, u: Array, v: Array) -> NDArray[np.bool_]:
-        """True where the lens does not fold between the optical axis and (u, v), and (u, v) is below _MAX_TANGENT."""
+        """True where the lens does not fold between the optical axis and (u, v), and |(u, v)| is below _MAX_TANGENT;
+        for an ideal lens, where (u, v) is finite."""
         good: NDArray[np.bool_] = np.isfinite(u) & np.isfinite(v)
         if self._ideal:
             return good
@@ -290,7 +291,7 @@ class Camera:
         return u.reshape(x.shape), v.reshape(x.shape)
 
     def tangent_slopes(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """(du/dx, dv/dx) per raw pixel along the row, for the rays (u, v)."""
+        """(du/dx, dv/dx) per raw pixel along the row, for the rays (u, v); NaN where the lens folds."""
         u_, v_ = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         du, _, dv, _ = self.lens.undistort_slope(u_, v_)
         fx = self.matrix[0, 0]

@@ -1,9 +1,9 @@
 """The sheet of light at one mirror command, flat or bowed, and the depth at which a pixel's ray meets it.
 
-A line lens spreads the beam into a fan of directions from an origin O. Let f be the fan's middle, t the direction
-across it (along the mirror's axis) and n the plane's normal. Light leaves at an angle phi within the plane and, if the
-sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (X - O).f, q = (X - O).t lies on the
-sheet if
+A line lens spreads the beam into a fan of directions from an origin O. Let f be the fan's middle, t the direction in
+the plane across f (along the mirror's axis), n the plane's normal. Light leaves at an angle phi within the plane and,
+if the sheet is bowed, at the angle bow phi^2 out of it towards n. A point X with p = (X - O).f, q = (X - O).t lies on
+the sheet if
 
     n.X = d + tan(bow phi^2) hypot(p, q),    phi = atan2(q, p),
 
@@ -91,7 +91,7 @@ _CONVERGED = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSheets:
-    """Sheets (...): planes (..., 4), |n| = 1; O (3,); unit vectors f and t (..., 3); the bow, 0 for planes."""
+    """Sheets (...): planes (..., 4), |n| = 1; O (3,); unit vectors f, t (..., 3); bow. With bow 0, O, f and t are 0."""
 
     planes: Array
     origin_m: Array
@@ -140,7 +140,7 @@ class LightSheets:
         return _met(u, v, w, self.planes[..., 3] * w)
 
     def _bowed(self, seen: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """For X - O, or (X - O) / z: the bow's distance off the plane, its slope by w, whether X lies ahead of O."""
+        """For X - O, or (X - O) / z: the bow's distance off the plane, slope by w = 1/z, whether X is ahead of O."""
         p, q = np.sum(seen * self.middle, axis=-1), np.sum(seen * self.across, axis=-1)
         dp, dq = -(self.middle @ self.origin_m), -(self.across @ self.origin_m)
         reach = np.hypot(p, q)

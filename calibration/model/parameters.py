@@ -85,7 +85,8 @@ def with_parameters(model: RigModel, names: Sequence[str], deltas: ArrayLike) ->
 
 
 def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
-    """The camera with its own part of the changes, which are removed from `change`. Raises CalibrationError."""
+    """The camera after those changes that concern it; they are removed from `change`. Raises CalibrationError if the
+    result is no valid camera."""
     matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
     touched = False
     for name, at in MATRIX.items():
@@ -100,7 +101,7 @@ def changed_camera(camera: Camera, change: dict[str, float]) -> Camera:
 
 
 def _pivot(scanner: PivotScanner, change: dict[str, float]) -> PivotScanner:
-    """The scanner with its own part of the changes, which are removed from `change`."""
+    """The scanner after those changes that concern it; they are removed from `change`."""
     first, axis = scanner.zero_normal, scanner.axis_direction
     second = np.cross(axis, first)
     turn_1, turn_2, shift_1, shift_2 = (change.pop(name, 0.0) for name in AXIS)
@@ -118,7 +119,7 @@ def _pivot(scanner: PivotScanner, change: dict[str, float]) -> PivotScanner:
 
 
 def _terms(terms: Array, stem: str, change: dict[str, float]) -> Array:
-    """The terms with the changes named stem0, stem1, ... added, which are removed from `change`; longer if needed."""
+    """The terms, more if needed, plus the changes named stem0, stem1, ...; these are removed from `change`."""
     asked = {i: f"{stem}{i}" for i in range(MOST_TERMS) if f"{stem}{i}" in change}
     result: Array = np.zeros(max([terms.size, *(i + 1 for i in asked)]))
     result[: terms.size] = terms
@@ -128,7 +129,7 @@ def _terms(terms: Array, stem: str, change: dict[str, float]) -> Array:
 
 
 def _rotation(vector: Array) -> Array:
-    """Rotation matrix (3, 3) of a Rodrigues vector, smooth at zero."""
+    """Rotation matrix (3, 3) of a Rodrigues vector, smooth at zero. Raises CalibrationError beyond half a turn."""
     if not np.all(np.abs(vector) <= np.pi):
         raise CalibrationError(f"axis turns by {np.abs(vector).max():.3g} rad; changes are small, at most half a turn")
     angle = float(np.linalg.norm(vector))
@@ -142,7 +143,7 @@ def _rotation(vector: Array) -> Array:
 SWEPT: Final = "velocities_per_s"
 """Key in a model's provenance: the signed velocities of the sweeps that its planes were found from."""
 ALIKE_SPEEDS: Final = 0.02
-"""Relative difference up to which two speeds count as one: a lag from two such speeds errs 50 times as much as a
+"""Relative difference up to which two speeds count as one: a lag from speeds so close errs 50 times as much as a
 passage."""
 SPEED_MARGIN: Final = 0.05
 """A measured lag is assumed to hold for speeds outside the measured ones by up to this share."""

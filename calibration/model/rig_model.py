@@ -67,7 +67,7 @@ class Lag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The rig that a calibration belongs to, its date and its verdict. They are compared before a model is used.
+    """The rig, date and verdict of a calibration. Programs check them before they use the model.
 
     rig: hash of the relevant part of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
     serials: of the devices by slot (spad, scanner, ...), if known. verdict, reasons: of the calibration and of its last
@@ -88,13 +88,13 @@ class RigModel:
     """Camera, scanner, lag, defects and provenance of one rig.
 
     speed_range_per_s: lowest and highest command speed for which the lag holds; None if the lag was not measured.
-    source_m: (3,) where the light leaves the mirror, camera frame; None if unknown.
+    source_m: (3,) where the light leaves the mirror, metres, camera frame; None if unknown.
     defects: (height, width) bool, True = pixel not to be used; None if unknown.
     dark_rate_per_s: (height, width) float32, counts per second in the dark; None if unknown.
     row_delay_s: delay of each row's exposure after that of the row above. gate_delay_s: delay of the light after the
     gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
     rising edge of a scan marker counts, rather than the falling one.
-    covariance: of the parameters that were estimated, see `parameters`. identity: None if it was not recorded.
+    covariance: of the parameters that were estimated, None if unknown. identity: None if it was not recorded.
     Raises CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and
     planes within 45 degrees of the image row, since they give no position along the row.
     """
@@ -137,7 +137,7 @@ class RigModel:
             )
 
     def _commands(self) -> Array:
-        """Commands over the whole range: those of a table, or a few."""
+        """Commands over the whole range: those of a table, otherwise 33, evenly spaced."""
         return np.asarray(getattr(self.scanner, "command", np.linspace(*self.scanner.command_range, 33)))
 
     def planes(self, commands: ArrayLike) -> Array:

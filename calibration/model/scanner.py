@@ -1,8 +1,7 @@
 """From mirror command to light plane (n, d), n.X = d, |n| = 1: a sampled table, or a mirror that turns about an axis.
 
 The command is the one used in the calibration: a galvo's normalised drive (-1 to 1), or the column number of a cube of
-frames. (n, d) and (-n, -d) are the same plane; the sign is chosen so that n_x > 0 for every plane that a
-`RigModel` accepts.
+frames. (n, d) and (-n, -d) are the same plane; the sign is chosen so that n_x >= 0, in a table on average.
 """
 
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ _MOST_OFFSET_M = 10.0
 _MOST_CONE_RAD = 0.5
 """A mirror that tilts the light more than this towards its axis is mounted wrongly."""
 _MOST_BOW_PER_RAD = 0.5
-"""With more, light at right angles to the fan's middle would leave the fan backwards. Laser lines have about 0.01."""
+"""At 0.64, light at right angles to the fan's middle would leave the fan backwards. Laser lines have about 0.01."""
 
 
 class Scanner(Protocol):
@@ -92,8 +91,9 @@ class PivotScanner:
 
         n(a) = cos(cone) (n0 cos a + (axis x n0) sin a) + sin(cone) axis,    d(a) = n . axis_point + offset(a)
 
-    axis_point_m, axis_direction, zero_normal: (3,) float64. angle_rad: (terms,) float64, the optical angle a as a
-    polynomial in the command, constant term first. The part of zero_normal along the axis is dropped.
+    axis_point_m, axis_direction, zero_normal (n0): (3,) float64; the part of n0 along the axis is dropped, then both
+    are scaled to length 1. angle_rad: (terms,) float64, the optical angle a as a polynomial in the command, constant
+    term first.
     offset_m: (terms,) float64, distance at which the light passes the axis, a polynomial in the optical angle, constant
     first.
     cone_rad: constant tilt of the normal towards the axis; the planes then touch a cone whose tip is axis_point_m.
@@ -151,7 +151,7 @@ class PivotScanner:
         return np.asarray(np.where(planes[..., :1] < 0, -planes, planes))
 
     def turned(self, commands: ArrayLike) -> Array:
-        """Planes (..., 4) with the sign of n(a), the sign that offset_m, cone_rad and bow_per_rad refer to."""
+        """`planes` with the sign of n(a), which is the sign that offset_m, cone_rad and bow_per_rad refer to."""
         at = _inside(commands, self.command_range)
         angle = np.polynomial.polynomial.polyval(at, self.angle_rad)[..., None]
         normal = self.zero_normal * np.cos(angle) + np.cross(self.axis_direction, self.zero_normal) * np.sin(angle)

@@ -1,11 +1,11 @@
 """Finds a sweep's passages (when the laser line passed over each pixel) and its picture in the counts of its columns.
 
-Passages are found for many pixels, spread evenly over the picture. The first step finds, for each pixel, the column at
-which the line stands out most from the columns on both sides. The second step fits the passage by maximum likelihood to
-the columns around it (`calibration.passages.fit`). Pixels without information are left out. Each passage has an sd; it
-is large within a flat top, where all frames hold a 1. The line must be visible in two columns or more. If columns are
-wider than 2 pixels, most pixels give no passage, so calibrate with many columns of few exposures rather than few
-columns of many.
+A column is a run of frames that are summed up. Passages are found for many pixels, spread evenly over the picture. The
+first step finds, for each pixel, the column at which the line stands out most from the columns on both sides. The
+second step fits the passage by maximum likelihood to the columns around it (`calibration.passages.fit`). Pixels without
+information are left out. Each passage has an sd; it is large within a flat top, where all frames hold a 1. The line
+must be visible in two columns or more. If columns are wider than 2 pixels, most pixels give no passage, so calibrate
+with many columns of few exposures rather than few columns of many.
 
 10 000 pixels of 500 columns take about 0.5 s.
 
@@ -136,11 +136,11 @@ MOST_PASSAGES = 2000
 TRIES = 6
 """Most pixels that are tried, as a multiple of the passages wanted."""
 CHUNK = 3000
-"""Pixels at a time."""
+"""Pixels that are fitted at a time."""
 NEAR_SIGMAS = 4.5
 """Reach of the line around its centre in sigmas, to which one column is added. Columns beyond determine only levels."""
 REACH = 14
-"""Columns on either side of the line's centre that are used; at least twice the reach of the line."""
+"""Columns on either side of the line's centre that are used, or twice the reach of the line if that is more."""
 FAR = 1e4
 SHAPES = (*(LineShape(box) for box in (0.0, 1.5, 2.5, 4.0)), LineShape(1.5, travels=True))
 """Shapes that are tried: lines at rest during a column, as with a DAC that moves in steps, and one that moves, for
@@ -148,7 +148,7 @@ which the pixel's width hardly matters."""
 MOST_LOSS = 2.0
 """Most by which one pixel's log-likelihood counts against a shape, so that no single bad pixel chooses for all."""
 LEAST_SAMPLE, SAMPLE = 50, 300
-"""The shape is chosen from at most SAMPLE pixels. If there are fewer than LEAST_SAMPLE, other pixels do not use it."""
+"""The shape is chosen from at most SAMPLE pixels. From fewer than LEAST_SAMPLE, it is not used for later pixels."""
 LEAST_SIGNIFICANCE = 5.0
 """Least significance of the line, in standard deviations."""
 MOST_MISFIT = 5.0
@@ -164,8 +164,8 @@ class SweepCounts:
     """The counts of a sweep.
 
     counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
-    command: (columns,), their mean mirror command, without any lag; NaN for columns without frames. x0: (columns,),
-    first pixel of each column's window. width: of the picture, in pixels.
+    command: (columns,), their mean mirror command, not corrected for lags; NaN for columns without frames. x0:
+    (columns,), first pixel of each column's window. width: of the picture, in pixels.
     """
 
     counts: Counts
@@ -221,7 +221,7 @@ def find_passages(
     most: int = MOST_PASSAGES,
 ) -> Passages:
     """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; none if the line is not
-    visible.
+    visible. direction, speed_per_s: of the sweep, as in `Passages`.
     """
     rows = sweep.counts.shape[1]
     pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
@@ -258,7 +258,7 @@ def _passages(
     sweep: SweepCounts, pixels: NDArray[np.int64], shape: _Shape | None
 ) -> tuple[tuple[NDArray[np.int64], Array, Array], _Shape | None]:
     """Those of the pixels that have a passage (m, 2), its centre and sd (m,) in columns; and the passages' shape, None
-    if too few pixels determine it.
+    if too few pixels determine it. shape: that of earlier pixels, if known.
     """
     ones, frames = sweep.at_pixels(pixels)
     sums = ColumnSums.of(ones, frames)
@@ -309,7 +309,7 @@ LEAST_COUNTS = 30.0
 
 
 def flux_picture(sweeps: tuple[SweepCounts, ...]) -> NDArray[np.float32]:
-    """Flux (rows, width) of the lit frames of sweeps over one scene, including dark counts; NaN outside all windows."""
+    """Flux (rows, width) per exposure of one scene from its sweeps, including dark counts; NaN outside all windows."""
     off = [_off_the_line(sweep) for sweep in sweeps]
     ones: Array = np.sum([part[0] for part in off], axis=0)
     frames: Array = np.sum([part[1] for part in off], axis=0)
@@ -407,7 +407,8 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """True (height, width) on the squares of a board whose corners were found (4 at least), and on the paper around."""
+    """True on the squares of a board whose corners were found (4 at least), and on the paper around. size: (height,
+    width) of the result."""
     at_m = board.corners_m[corners.ids][:, :2]
     homography, _ = cv2.findHomography(at_m, corners.px, method=0)
     mask = np.zeros(size, np.uint8)

@@ -6,7 +6,7 @@ Of n frames in column t, y have a 1: y ~ Binomial(n, 1 - exp(-flux)), and around
 
 with phi and Phi the normal density and its integral. The terms are the level of the haze before the line, its change
 behind the line, and the line. Line, pixel and the line's travel within a column all blur the passage symmetrically;
-sigma describes all three together. `LineShape.box`, the width of pixel and travel in widths of the line, says how flat
+sigma describes all three together. `LineShape.box`, the width of pixel and travel in sds of the line, says how flat
 they make the peak. That suffices if few frames hold a 1. If many do, the motion of the line within a column matters:
 the frames of a column see different fluxes, and their 1s follow the mean of their probabilities, not the probability at
 their mean flux. With `LineShape.travels` sigma describes line and pixel alone, and a column's frames lie at places u:
@@ -262,7 +262,7 @@ def _centred(
     ones: Array, frames: Array, at: Array, shape: LineShape, theta: Array, sd: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Move the centres of `theta` to their means; return sd and `settled`. Repeat once where the sd was far from the
-    assumed one.
+    assumed one or the places did not cover the centre's range.
     """
     sd, settled, again = sd.copy(), np.ones(len(sd), np.bool_), np.arange(len(sd))
     for _ in range(2):

@@ -30,7 +30,7 @@ from calibration.views import BoardPose, View, robust_sd
 MOST_ROUNDS = 16
 """Most rounds of fitting and deciding; all but the last add a term, fix a lag, drop a view or settle noise."""
 MOST_IDLE_ROUNDS = 4
-"""Most rounds without a decision: contradictory data may keep a fit from ever converging."""
+"""Most rounds in a row without a decision: contradictory data may keep a fit from ever converging."""
 SETTLED_SHARE = 0.02
 """Relative change of the noise that is still allowed in the last round."""
 MOST_ODD_SHARE = 1 / 3
@@ -41,8 +41,8 @@ MOST_ODD_SHARE = 1 / 3
 class Rounds:
     """The state of alternately fitting and deciding.
 
-    base: groups of parameters that are free at the beginning; free: those free now. decisions: the latest ones about
-    terms; kept: those that changed the model.
+    base: groups of parameters, with one value each, that are free at the beginning; free: those free now. decisions:
+    the latest ones about terms; kept: those that changed the model.
     """
 
     problem: RigProblem
@@ -59,7 +59,7 @@ class Rounds:
         self.free = list(self.base)
 
     def run(self) -> None:
-        """Fit and decide until nothing changes."""
+        """Fit and decide until nothing changes or rounds are over. Raises Degenerate or LinAlgError, as `solved`."""
         idle = 0
         for _ in range(MOST_ROUNDS):
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)
@@ -135,9 +135,9 @@ def _settled(before: Noise, after: Noise) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepFit:
-    """The residuals of the passages of one sweep of a view; all float64 (m,), sorted by command.
+    """The residuals of the passages of one sweep of a view, in the order of its `Sighting`; arrays are (m,) float64.
 
-    command: the mirror's command in the model. residual, sd: in command units.
+    command: the mirror's position, that is the command corrected for lags. residual, sd: in command units.
     """
 
     view: str
@@ -165,12 +165,12 @@ def sweep_fits(seen: rig_state.Sighting, residual: Array, timing: Array) -> tupl
 class RigFit:
     """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted minus seen, sweeps.
 
-    left_out: names of views without corners; outliers: names of views that do not fit the others and were not used.
-    noise: estimated from the residuals; corner_scale: median sd of the corners as a multiple of `noise.corner_sd_px`.
-    misfit: factor by which variances were multiplied, 1 if the model describes everything. condition: condition number
-    of the scaled equations of the shared parameters. converged: False if contradictory data keep the fit from
-    converging. decisions: about terms and lags. free: the fitted parameters, where the names of one group share a
-    value; information: (free, free), the inverse of their covariance before `misfit.widening`.
+    left_out: names of views without enough corners; outliers: names of views that do not fit the others and were not
+    used. noise: estimated from the residuals; corner_scale: median sd of the corners as a multiple of
+    `noise.corner_sd_px`. misfit: factor by which variances were multiplied, 1 if the model describes everything.
+    condition: condition number of the scaled equations of the free parameters. converged: False if the last fit did
+    not converge, as with contradictory data. decisions: about terms and lags. free: the fitted parameters; the names of
+    one group share a value. information: (free, free), the inverse of their covariance before `misfit.widening`.
     """
 
     model: RigModel
@@ -217,8 +217,8 @@ def result_of(
 ) -> RigFit:
     """The result of finished rounds. Properties that were not fitted are taken from `start`, if there is one.
 
-    left_out: names of views without corners. velocities: the signed velocities of all sweeps. Raises Degenerate if
-    depth is almost unknown.
+    left_out: names of views without enough corners. velocities: the signed velocities of all sweeps. Raises Degenerate
+    if depth is almost unknown.
     """
     problem, solution, state = fit.problem, fit.solution, fit.state
     lags = misfit.lag_decisions(solution, problem, fit.free, state.timing, bool(lag_groups(velocities)))
@@ -288,10 +288,10 @@ def fit_rig(
     camera: the start value of the camera (None: `start`'s or OpenCV's).
     known: covariance of that camera from pictures other than these, by the names of its parameters. Parameters with a
     variance of 0 are known exactly and not fitted.
-    start: its mirror and times are the start values of the fit, and what is not fitted is kept, such as source and
-    defects; its command range grows if passages lie outside.
-    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError for another sensor's
-    or a tilted camera.
+    start: its mirror and times are the start values of the fit, unless it holds a table of planes. What is not fitted
+    is kept, such as source and defects; its command range grows if passages lie outside.
+    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError for the camera of
+    another sensor or of a tilted one.
     """
     shown = rig_state.usable(views)
     if not shown:

@@ -36,7 +36,7 @@ class TermDecision:
 
     name: str
     kept: bool
-    """Whether the term is in the model."""
+    """Whether the term belongs in the model."""
     value: float
     sd: float
     reason: str
@@ -46,7 +46,7 @@ class TermDecision:
 
 
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
-    """Sets of terms that could be added next. The last term of each set is the one that is judged."""
+    """Sets of terms that could be added next; the last of each is judged. row_delay: whether that may be a term."""
     names = {name for group in free for name in group}
     order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
     tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]
@@ -101,8 +101,8 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 def lag_decisions(
     solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array, determined: bool
 ) -> list[TermDecision]:
-    """The decisions on the lags that are still free; one for both if the sweeps' directions and speeds do not determine
-    them.
+    """The decisions on the lags that are still free; one for both if they share a value, or if the sweeps' directions
+    and speeds do not determine them.
     """
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
     decisions = []
@@ -151,13 +151,13 @@ def corner_noise(problem: RigProblem, solution: RigSolution, noise: Noise) -> fl
 
 
 SCANNER_MOVES = (*AXIS, "angle_0")
-"""Parameters that change when a scanner is knocked: five of six, since a shift along the axis changes nothing."""
+"""Parameters of the scanner's place, which a knock changes: five of six, as a shift along the axis changes nothing."""
 ODD_CHI2 = 60.0
 """Least fall of chi2 if an odd view gets a scanner place of its own. Chance alone gives 20 once in a thousand views."""
 ODD_TIMES = 8.0
 """Least such fall as a multiple of the other views' median, in case the model fits none of the views well."""
 EXPLAINED_SHARE = 0.05
-"""A view is odd too if its own place of the scanner leaves at most this share of the misfit, if OTHERS_SHARE and
+"""A view is odd too if its own place of the scanner leaves at most this share of the misfit, and OTHERS_SHARE and
 LEAST_EXPLAINED hold as well."""
 OTHERS_SHARE = 0.3
 """Least share of the misfit that must be left if any other view has its own place of the scanner instead."""
@@ -168,16 +168,16 @@ FEWEST_TO_TELL = 4
 UNDECIDED_SD = 2.5
 """Significance from which on a term that was not added widens the covariance by the change that it would cause."""
 MISFIT_SD = 3.0
-"""Sds by which chi2 of the slow misfit must exceed its mean before it is believed."""
+"""Sds by which chi2 of the corners, or of slow variations, must exceed its mean before it is believed."""
 
 
 def odd_view(problem: RigProblem, solution: RigSolution, left: "Misfit") -> int | None:
-    """The view that fits best with another scanner position, if it stands out, else None. left: the misfit of the fit.
+    """Index of the view that gains most from a scanner place of its own, if it stands out, else None. left: the misfit.
 
-    Each view's equations tell how far chi2 would fall if the scanner had a separate position for this view alone. Views
+    Each view's equations tell how far chi2 would fall if the scanner had another place for this view alone. Views
     without passages are left out: their fall is always zero, and any other view would stand out from them. With few
-    views, one that does not fit bends the fit so far that the others seem to need another position too; but only a
-    separate position for the view that does not fit removes the misfit.
+    views, one that does not fit bends the fit so far that the others seem to need another place too; but only another
+    place for the view that does not fit removes the misfit.
     """
     counted = np.flatnonzero(problem.counted & with_passages(problem))
     gains = np.array([_own_place(problem, solution, int(view)) for view in counted])
@@ -247,7 +247,7 @@ class Misfit(NamedTuple):
 
 
 def of_fit(problem: RigProblem, solution: RigSolution) -> Misfit:
-    """The contradictions of corners and passages with each other, and of passages among themselves."""
+    """The misfit: contradictions of corners and passages with each other, and of passages among themselves."""
     covariance = solution.covariance(problem.tie)
     corner_chi2 = corner_free = slow_chi2 = slow_free = taken = 0.0
     for view, own in enumerate(solution.views):

@@ -1,8 +1,8 @@
 """The noise of corners and passages, estimated from their residuals.
 
-Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror, which
-all pixels crossed at the same instant share (jitter), and what the model does not describe, which varies slowly over a
-sweep. To separate the third kind from the others, each sweep's own smooth part is removed first. Then, in narrow bins
+Passages have three kinds of error: that of their own photons (their sd, times one factor), that of the mirror (jitter,
+shared by all pixels that the line crosses at one instant), and what the model does not describe, which varies slowly
+over a sweep. To separate the third from the others, each sweep's own smooth part is removed first. Then, in narrow bins
 of the command, products of different passages of a bin give the jitter's variance, products across bins its reach, and
 the scatter within a bin the factor.
 
@@ -22,7 +22,7 @@ from calibration.rig_fit.rig_state import Sighting
 from calibration.views import MAD_TO_SD, robust_sd
 
 BINS = 1024
-"""Bins of the whole command range: several per column. Jitter hardly changes within a bin."""
+"""Bins of the whole command range: several per column of a sweep. Jitter hardly changes within a bin."""
 MOST_REACH_BINS = 96
 LEAST_FACTOR = 0.3
 """Least factor on the passages' own sds: these are assumed to be at most about three times too large."""
@@ -42,8 +42,8 @@ SIGNIFICANT_SD = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """The noise of a fit. corner_sd_px: sd of each coordinate of a corner of scale 1. passage_factor: factor on
-    passages' sd.
+    """The noise of a fit. corner_sd_px: sd of each coordinate of a corner whose `Sighting.corner_scale` is 1.
+    passage_factor: factor on passages' sd.
 
     jitter_sd: of the mirror, in command units; reach: largest difference of commands over which it is shared.
     """
@@ -108,8 +108,8 @@ def passage_noise(residuals: Sequence[Array], sightings: Sequence[Sighting]) -> 
     """(factor, jitter sd, reach) from the passages' residuals of all views.
 
     The mirror's error is assumed constant for a while, so the covariance of two passages falls linearly with the
-    difference of their commands. Of all lengths, the one that differs most significantly from independent errors is
-    taken; the jitter is 0 if none is significant.
+    difference of their commands, to 0 at `reach`. The reach that differs most significantly from independent errors is
+    taken. If none is significant, the jitter is 0 and the reach one bin.
     """
     shown = [seen.command for seen in sightings if seen.command.size]
     width = (max(float(command.max()) for command in shown) - min(float(command.min()) for command in shown)) / BINS

@@ -102,14 +102,14 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
 
 
 def corner_scale(corners: Corners) -> Array:
-    """Relative sd of each corner, 1 if the picture gave none."""
+    """(n,) sd of each corner over the usual one, 1 if the picture gave none."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
     return np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX
 
 
 def usable(views: Sequence[View]) -> list[View]:
-    """The views with enough corners for a pose, without corners at invalid positions."""
+    """The views with enough corners for a pose, not all on one line; without corners whose position is not finite."""
     found = []
     for view in views:
         if view.corners is None:
@@ -193,7 +193,7 @@ class RigState:
 
 
 def first_state(model: RigModel, timing: Array, poses: Sequence[BoardPose], sightings: Sequence[Sighting]) -> RigState:
-    """The state for a model, without the model's own lags."""
+    """The state for a model, with `timing` instead of the model's own lags."""
     rays = tuple(np.stack(model.camera.tangents_at(seen.x_px, seen.y_px)) for seen in sightings)
     timeless = replace(model, lag_s=type(model.lag_s)(), row_delay_s=0.0, covariance=None)
     return RigState(timeless, np.asarray(timing, np.float64), tuple(poses), rays)
@@ -266,7 +266,7 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
-    """Start values of a fit: a mirror and (lag forward, lag backward, 0).
+    """Start values of a fit: a mirror and (lag forward, lag backward, 0), lags within 0 and MOST_FIRST_LAG_S.
 
     Lags that the sweeps cannot separate get one value; if the sweeps determine neither, both are 0.
     """
@@ -327,7 +327,7 @@ def _angles(planes: Array, axis: Array, first: Array) -> Array:
 
 
 def _lags(velocities: Array, curves: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
-    """Least squares of c(angle) = c0 + velocity lag over the sweeps, at an angle that all have."""
+    """Both lags, by least squares of c(angle) = c0 + velocity lag over the sweeps, at an angle in their middle."""
     ties = lag_groups(velocities)
     if not ties:
         return 0.0, 0.0
@@ -394,14 +394,12 @@ def check_poses(points_m: Array, poses: Sequence[BoardPose]) -> None:
 
 
 def reason_of(poses: Sequence[BoardPose]) -> str:
-    """The likeliest reason why boards at these poses determine too little. Only `coplanar` is certain; others are
-    guesses.
-    """
+    """'too-few-poses' or 'no-tilt': a guess at why boards at these poses determine too little."""
     return "too-few-poses" if spread_rad(poses) >= LEAST_TILT_RAD and len(poses) < 6 else "no-tilt"
 
 
 def no_start(error: Exception, poses: Sequence[BoardPose]) -> Degenerate:
-    """The error for views from which not even a first guess of a rig can be made."""
+    """The error for views that fit no mirror, whether this shows in the first guess or in the fit."""
     return Degenerate(
         reason_of(poses),
         f"light on {len(poses)} boards fits no mirror: {error}; show the board at 8 or more poses, at several "
@@ -422,9 +420,7 @@ def check_depth(
     misfit: float = 1.0,
     outliers: Sequence[str] = (),
 ) -> None:
-    """Raise Degenerate if the poses hardly determine depth, even if the misfit were removed, or if the line reaches
-    nothing.
-    """
+    """Raise Degenerate if the line reaches nothing, or the poses hardly determine depth even without the misfit."""
     camera = model.camera
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * camera.width, np.linspace(0.1, 0.9, 5) * camera.height)
     for at_m in (AT_M, float(np.median([np.linalg.norm(pose.position_m) for pose in poses]))):

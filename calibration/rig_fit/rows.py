@@ -3,12 +3,12 @@
 A passage compares the mirror command at which the line crossed a pixel with the command c at which the light sheet
 meets the pixel's ray on the board. With F the distance of that point X from a sheet along its normal n (see
 `light_sheet`), F(c) = 0, and the residual, in units of the command, changes with a parameter p by (dF/dp) / (dF/dc).
-With the ray r, X = t r on the board's plane m.(X - P) = 0: a turn w and shift s of the board move X along r, which
-changes F by (n.r / m.r) (w.(m x (P - X)) + m.s), and a change dr of the ray changes it by t (n - (n.r / m.r) m).dr.
+With the ray r, X = t r lies on the board's plane m.(X - P) = 0 (m its normal, P its position). A turn w and shift s of
+the board move X along r, which changes F by (n.r / m.r) (w.(m x (P - X)) + m.s). A change dr of the ray changes F by
+t (n - (n.r / m.r) m).dr.
 
-When row y sees the light, the mirror is where its command was lag - row_delay y earlier. Derivatives by
-parameters are in the order of `Terms.names`; the turns and shifts of the axis are those of
-`calibration.model.parameters`.
+When row y sees the light, the mirror is where its command was lag - row_delay y earlier. Derivatives by parameters are
+in the order of `Terms.names`; the turns and shifts of the axis are those of `calibration.model.parameters`.
 """
 
 from collections.abc import Sequence

@@ -7,9 +7,9 @@ instants, and D the diagonal of their own variances,
 
     V = D + s^2 11',    V^-1 = D^-1 - k (D^-1 1)(D^-1 1)',    k = s^2 / (1 + s^2 1'D^-1 1)
 
-so a bin contributes the sum over its passages minus k times a product of sums. A view's pose affects only that view:
-with N = [[A, B'], [B, C]] (A shared, C the pose's own) the view adds A - B'C^-1 B to the shared equations, and its pose
-follows from their solution.
+where 1 is a column of ones. So a bin contributes the sum over its passages minus k times a product of sums. A view's
+pose affects only that view: with its equations N = [[A, B'], [B, C]] (A of shared parameters, C of the pose) the view
+adds A - B'C^-1 B to the shared equations, and its pose follows from their solution.
 """
 
 from collections.abc import Sequence
@@ -173,7 +173,7 @@ class RigProblem:
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSolution:
     """A state with its residuals, the equations of all shared parameters (p, p), (p,), and the condition of the free
-    ones.
+    ones. converged: whether the next step promises too little to be worth taking.
     """
 
     state: RigState
@@ -193,9 +193,10 @@ class RigSolution:
 
 
 def solved(problem: RigProblem, state: RigState, noise: Noise, *, roughly: bool = False) -> RigSolution:
-    """The best state for this noise. Raises Degenerate if it is not unique, LinAlgError if a view's pose is not.
+    """The best state for this noise; `converged` is False if no step helps or MOST_STEPS are over before it is reached.
 
-    roughly: whether to stop once it is accurate enough for decisions.
+    roughly: whether to stop once the state is accurate enough for decisions. Raises Degenerate if the equations do not
+    determine the free parameters, LinAlgError if they do not determine a view's pose.
     """
     rows = all_rows(state, problem.sightings, problem.terms)
     damping, jitter = 0.0, noise.jitter_sd**2
@@ -291,9 +292,7 @@ def _counted(views: Sequence[ViewNormal], problem: RigProblem) -> list[ViewNorma
 
 
 def camera_prior(known: Covariance, camera: Camera, terms: Terms) -> Prior | None:
-    """The prior from a camera that was calibrated from other pictures, with its covariance; None if it is known
-    exactly.
-    """
+    """The prior from a camera and its covariance, from other pictures; None if no parameter to fit has a variance."""
     variance = dict(zip(known.names, np.diag(known.matrix), strict=True))
     names = [name for name in known.names if name in terms.camera and variance[name] > 0]
     if not names:

@@ -31,10 +31,10 @@ SPARE_FRAMES = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """An edge of the light. chi2: (times,), for the edge at each of the times. brightness, brightness_sd: number of
-    extra ones in a lit frame, and its sd.
+    """An edge of the light. chi2: (times,), for the edge at each of the times, inf if it cannot be there. brightness,
+    brightness_sd: number of extra ones in a lit frame, and its sd.
 
-    scatter: variance of the ones around the fit in units of that of photons; chi2 and the sd include it.
+    scatter: variance of the ones around the fit in units of that of photons, 1 at least; chi2 and the sd include it.
     """
 
     chi2: Array

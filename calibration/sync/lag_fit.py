@@ -1,7 +1,7 @@
-"""The lags of light, mirror and frames, from sweeps over one unmoved scene at several speeds, in both directions.
+"""The mirror's lags and the row delay, from sweeps over one unmoved scene at several speeds, in both directions.
 
 A pixel sees the line at one mirror position, whatever the speed. In a sweep with direction s = +1 or -1 and speed v
-the line reaches that position at the command (`Passages` in calibration/views.py)
+the line reaches that position, for a pixel in row y, at the command (`Passages` in calibration/views.py)
 
     command = position + s v (lag(s) - row_delay y)
 
@@ -17,9 +17,9 @@ needs rows, not speeds. A row delay that is known from elsewhere is combined wit
 contradict each other significantly; if nothing is known it is 0.
 
 A constant delay of the markers behind the mirror's command (the scanner's colour outputs trail its mirror outputs by
-some microseconds, docs/reference/devices/helios.md) shortens both lags; they are then right for binding with the same
-markers. A marker of the wrong polarity shows in the binding; the gate's delay shows in the frames at its edges
-(`gate_fit`).
+some microseconds, docs/reference/devices/helios.md) shortens both lags. They are then right where frames are bound to
+commands by the same markers. A marker of the wrong polarity shows when frames are bound; the gate's delay shows in the
+frames at its edges (`gate_fit`).
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ LEAST_PIXELS = 50
 CLUSTERS = 64
 """Parts of the command range within which the mirror's jitter is assumed to be common to all pixels."""
 LEAST_SHARE = 1e-9
-"""Smallest eigenvalue of the scaled equations; below it only rounding separates the unknowns."""
+"""Least eigenvalue of the scaled equations; below it only rounding separates the unknowns."""
 MOST_OFF = 4.7
 """Residuals, in robust standard deviations, from which on a passage does not count."""
 
@@ -194,7 +194,7 @@ class SweepTiming:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyncFit:
-    """Fitted lags. lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three.
+    """Fitted lags. lag_s, row_delay_s: as in `RigModel`. covariance: (3, 3), s^2, of the three; NaN where unknown.
 
     speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: the
     directions that were scanned, +1 and -1. row_told: whether the row delay was determined; if not, it is the one known
@@ -217,7 +217,8 @@ class SyncFit:
 
     @property
     def sd_s(self) -> Array:
-        """Standard deviations (3,) of both lags and the row delay; NaN for a direction that was not scanned."""
+        """Standard deviations (3,) of both lags and the row delay; NaN for a direction that was not scanned, and of the
+        row delay if all pixels lie in one row."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -232,8 +233,8 @@ class SyncFit:
 
 
 def fit_sync(sweeps: Sequence[Passages], row_delay_s: float = 0.0, row_delay_sd_s: float = 0.0) -> SyncFit:
-    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: previous knowledge of the
-    row delay.
+    """Lags and row delay from the passages of one unmoved scene. row_delay_s, row_delay_sd_s: the row delay as known
+    before, and its sd, 0 if that is not known.
 
     Raises Degenerate if they cannot be determined: one-speed, too-few-pixels, marker-polarity, negative-lag.
     """

@@ -1,8 +1,8 @@
 """A model with lags from other sweeps, and the consequences for its mirror's angle.
 
 A mirror's angle was fitted together with lags. With other lags the fit would have given another angle, by an amount
-that follows from the covariance C of all parameters. If the sweeps of the planes did not separate the lags
-(`calibration.model.parameters`), any lags are possible, each with its own angle, and C is very large in that direction.
+that follows from the covariance C of all parameters. If the sweeps that gave the planes did not separate the lags
+(`calibration.model.parameters`), many lags are possible, each with its own angle, and C is very large that way.
 With x the lags, y the other parameters, S the covariance of the new lags:
 
     y | x = y0 + A (x - x0),    A = C_yx C_xx^-1,    cov y = (1 -A) C (1 -A)' + A S A',    cov (y, x) = A S
@@ -42,8 +42,8 @@ def known_row_delay(base: RigModel) -> tuple[float, float]:
 
 
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with these lags, which were fitted with its `known_row_delay`; and the reason why its angle cannot be
-    right then, or None.
+    """The model with the lags of `fit`, which were fitted with the model's `known_row_delay`; and the reason why its
+    mirror's angle cannot be right then, or None.
     """
     assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)
@@ -82,7 +82,8 @@ def _told(fit: SyncFit) -> tuple[dict[str, float], Array]:
 def _slopes(
     base: RigModel, known: Array, names: tuple[str, ...], lags: int, change: Array, spread: Array
 ) -> tuple[Array, Reason | None]:
-    """The slopes A (others, lags) of the other parameters by the lags (the last names); the reason if none is known."""
+    """The slopes A (others, lags) of the other parameters by the lags (the last names), and the reason why the others
+    cannot be right, or None. The slopes are 0 if the others stay as they were."""
     n = len(names) - lags
     slopes = np.zeros((n, lags))
     velocities = base.provenance.get(SWEPT) or ()

@@ -1,4 +1,4 @@
-"""`python -m drivers.guard SOCKET PAGE` runs the guard. Only `drivers.guard.client.Guard` starts it."""
+"""`python -m drivers.guard SOCKET PAGE` (file descriptors) runs the guard; only `drivers.guard.client` does so."""
 
 import os
 import sys

@@ -41,14 +41,14 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and send what the socket accepts within that time. A peer that is gone raises no error."""
+        """Queue a message and send what the socket accepts within `within_s`. A peer that is gone raises no error."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line
         self.flush(within_s)
 
     def flush(self, within_s: float = 0.0) -> None:
-        """Send what is still queued, as much as the socket accepts within that time."""
+        """Send what is still queued, as much as the socket accepts within `within_s`."""
         ends_at = time.monotonic() + within_s
         with self._lock:
             while self._unsent:
@@ -103,7 +103,7 @@ def error_from(message: list[str]) -> DeviceError:
 
 
 def plain_ports(ports: Mapping[str, Any]) -> dict[str, str]:
-    """Addresses of the emulated ports by name, without those that exist only in this process's memory."""
+    """Addresses of the emulated ports by name, without USB and serial ports that are only in this process's memory."""
     return {name: port.address for name, port in ports.items() if port.usb_backend is None and port.serial_port is None}
 
 

@@ -129,7 +129,7 @@ ANSWER_S = {"arm": 180.0, "program": 20.0}
 """Time for the answer to a method. For `arm`, the `warm_up` of the laser's config is added."""
 USUAL_ANSWER_S = 10.0
 LOWER_S = 5.0
-"""Time for the rescue after the guard is gone."""
+"""Longest wait for the rescue after the guard is gone."""
 SILENCE_S = 2.0
 """A guard that gives no sign of life for this long, while this process is awake, counts as hung and is killed."""
 BUSY_SILENCE_S = 5.0
@@ -239,8 +239,8 @@ class Guard:
         """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
         Raises `failure` instead of switching anything on, `DeviceTimeout` if it takes too long, and `GuardLost` if the
-        guard is gone. A method that makes a device safe raises `GuardLost` only once the application has tried to make
-        it safe itself.
+        guard is gone. A method that makes a device safe then first waits, at most `LOWER_S`, until the application has
+        tried to make the devices safe itself.
         """
         if self.failure is not None and verb in _ENABLING:
             raise self.failure

@@ -87,7 +87,7 @@ class Owned:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy in the application reports unasked. May raise DeviceError."""
+        """Open the device; returns what its proxy in the application can tell without asking. May raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -135,7 +135,7 @@ class Owned:
 
     @property
     def due(self) -> bool:
-        """Whether it is time for an attempt to make the device safe and none is under way."""
+        """Whether it is time for an attempt to make the device safe, and no attempt is under way."""
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:

@@ -3,10 +3,10 @@
 The main thread never touches a device. It reads messages, looks at the application every 10 ms and queues jobs for the
 threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is
 stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or stops
-answering; or when the guard is told to end. In a trip all outputs of the gate go low and the laser is paused, both at
-the same time. Afterwards an application that cannot go on by itself is killed, the laser is disarmed and the ports are
-closed. If frames stop because the gate's program has ended, the laser is only paused. "The gate" in this module is the
-sync source, which drives the gate.
+answering; or when the guard is told to end. In a trip all outputs of the gate go low; at the same time the laser is
+paused and, if it was armed, disarmed. An application that was stopped or took no frames is killed, unless it makes its
+rig safe in time. The ports are closed when the guard ends. If frames stop because the gate's program has ended, the
+laser is only paused. "The gate" in this module is the sync source, which drives the gate.
 
 `Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
 makes the devices safe as far as it can.
@@ -74,7 +74,7 @@ class GuardProcess:
         self._terminated = False
 
     def run(self) -> int:
-        """Serve the application until it says goodbye or is gone."""
+        """Serve the application until it says goodbye or is gone, or a signal tells the guard to end (SIGTERM)."""
         signal.signal(signal.SIGTERM, self._on_terminate)
         before = seen = time.monotonic()
         while not self._ending:
@@ -211,7 +211,7 @@ class GuardProcess:
                 application.kill()
 
     def _suspect(self, trouble: str, stopped: bool, now: float) -> None:
-        """Act on missing frames, unless the gate reports in time that its program has ended by itself."""
+        """Trip the application. If it is not stopped, ask the gate first, and do nothing if its program has ended."""
         sync = self._owned.get("sync")
         if stopped or sync is None or (self._check_until is not None and now > self._check_until):
             self._trip_application(trouble, stopped)
@@ -226,7 +226,7 @@ class GuardProcess:
         self._check_until = None
 
     def _note_end(self, sync: Owned) -> bool:
-        """Ask the gate if its program has ended. If so, stop watching and pause the laser. Runs on a gate's lane."""
+        """Whether the gate's program has ended. If so, stops watching and pauses the laser. Runs on a gate's lane."""
         try:
             status = sync.device.status
         except DeviceError:
@@ -297,7 +297,7 @@ class GuardProcess:
         return True
 
     def _make_safe(self) -> None:
-        """Queue an attempt to make safe each device for which one is due."""
+        """Queue an attempt to make a device safe, for each device that is `due`."""
         with self._trip_lock:
             due = [owned for owned in self._owned.values() if owned.due]
             for owned in due:
@@ -307,7 +307,7 @@ class GuardProcess:
             lane.do(owned.try_safe, first=True)
 
     def _end(self) -> int:
-        """Make safe what is not yet, and close everything; returns the exit code."""
+        """Make those devices safe that are not safe yet, and close all; returns the exit code."""
         ends_at = time.monotonic() + GIVE_UP_S
         while any(owned.unsafe for owned in self._owned.values()) and time.monotonic() < ends_at:
             self._make_safe()
@@ -351,7 +351,7 @@ class Rescue:
     """Makes gate and laser safe at the same time, each on its own thread."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
-        """Find the drivers now: there will be no time to import them."""
+        """Import the drivers, for which there is no time in a rescue."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
         self._off: dict[str, tuple[Callable[[], SerialPort], bytes]] = {}

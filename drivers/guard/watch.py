@@ -1,9 +1,9 @@
 """Decides whether an application that should be taking frames still does, and inspects its process from outside.
 
 A single deadline on frames would either leave the laser on too long or trip on a busy machine. So there are two: a
-short one for an application whose threads are all asleep, and a longer one for one that works or waits for a processor
-or a disk. Work does not count when the source thread reports that the SPAD gives no frames. If the guard itself was
-held up, only a short step of that time counts, since what stops the guard may have stopped the application as well.
+short one for an application whose threads are all asleep, and a longer one for an application that works or waits for a
+processor or a disk. Work does not count when the source thread reports that the SPAD gives no frames. If the guard
+itself was held up, only a short step of that time counts: what stops the guard may have stopped the application too.
 
 The state of a process comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of
 Linux, the first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd. The pidfd
@@ -39,9 +39,9 @@ class GuardLimits:
     late and disks stall for a second; neither may end a scan. No spot is burnt meanwhile: each sweep waits, with the
     gate low, for a scan marker, so that light is out only while the mirror moves."""
     waits_within_s: float = 0.04
-    """Limit for an application at work whose source thread reports that the SPAD has given no frames for this long."""
+    """If the source thread reports no frames from the SPAD for longer, work is no excuse: `frames_within_s` holds."""
     first_wait_s: float = 0.3
-    """This limit, before the first frame."""
+    """The same before the first frame."""
     first_frame_s: float = 1.0
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""
@@ -162,8 +162,8 @@ class WatchedProcess:
         """Whether its threads worked for a good part of the time since `note_progress`, or run or wait for a processor
         or a disk now.
 
-        The answer is False only after two looks in a row. Threads are looked at one after the other, and work may pass
-        from one that was not yet looked at to one that was.
+        The answer is False only if two looks in a row find the process asleep: threads are looked at one after the
+        other, and work may pass from a thread not yet looked at to one that already was.
         """
         asleep_before, self._found_asleep = self._found_asleep, self._asleep()
         return not (asleep_before and self._found_asleep)

@@ -35,10 +35,10 @@ OPEN_STATES = (DeviceState.READY, DeviceState.CONFIGURED, DeviceState.RUNNING)
 
 
 class Device(ABC):
-    """An open device. Creating one opens it or raises; `close`, or leaving the `with` block, closes it.
+    """A device, open from its creation until `close` or the end of a `with` block.
 
-    The public methods of the interfaces check state and arguments, log, and call one `_do_*` hook each. A driver writes
-    only the hooks and never touches the state. Methods must be called from one thread unless they say otherwise.
+    The public methods of the interfaces check state and arguments, log, and call hooks (`_do_*`). A driver implements
+    the hooks and never touches the state. Methods must be called from one thread unless they say otherwise.
     """
 
     def __init__(self, name: str) -> None:
@@ -57,7 +57,7 @@ class Device(ABC):
 
     @property
     def serial(self) -> str | None:
-        """The device's serial number, or, in place of that, a permanent name stored in it; None if it has neither."""
+        """The device's serial number, or else a permanent name stored in it; None if the driver knows neither."""
         return None
 
     @property
@@ -66,10 +66,10 @@ class Device(ABC):
         return self._state
 
     def close(self) -> None:
-        """Leave the device safe (laser paused, gate low, a mirror that moved parked) and release it.
+        """Leave the device safe (laser paused, gate low, mirror parked if it has moved) and release it.
 
-        A second call does nothing. If the device was unplugged, that is logged as an error, and nothing is raised:
-        there is nothing left to be done from here. Any other failure to leave it safe is raised.
+        A second call does nothing. If the device was unplugged, nothing can be done about it from here, so nothing is
+        raised, except for a device that the guard owns (`drivers.guard`). Any other failure to leave it safe is raised.
         """
         if self._state is DeviceState.CLOSED:
             return
@@ -102,10 +102,10 @@ class Device(ABC):
 
     @abstractmethod
     def _make_safe(self) -> None:
-        """End what still runs; called once by `close`, in any state. Each interface implements it."""
+        """End what still runs; called once by `close`, in any open state. Each interface implements it."""
 
     def _lost_at_close(self, error: DeviceDisconnected) -> None:
-        """Say that the device was unplugged, so that `close` could not leave it safe."""
+        """Log that the device was unplugged, so that `close` could not leave it safe. The guard's devices raise it."""
         _log.error("%s: closed, but it could not be left safe: %s", self._name, error)
 
     @abstractmethod

@@ -23,8 +23,8 @@ class Grabbed:
 
     number: int64 (n,), number of each frame since the start; a number that is missing is a lost frame. bits: uint8
     (n, height, row bytes), rows packed as by `numpy.packbits`, padded with 0 to whole 64-bit words. records: (n,) of
-    `drivers.frames.FRAME_RECORD`, such as the markers seen. asked: frames asked for. width: pixels of a row. timing: of
-    the frames.
+    `drivers.frames.FRAME_RECORD`, with the markers seen, for example. asked: frames asked for. width: pixels of a row.
+    timing: of the frames.
     """
 
     number: NDArray[np.int64]
@@ -41,7 +41,7 @@ class Grabbed:
 
     @property
     def frames(self) -> NDArray[np.bool_]:
-        """The frames as bool (n, height, width), True where a photon was detected; eight times the memory of `bits`."""
+        """The frames as bool (n, height, width), True where a photon was detected; up to 8 times as large as `bits`."""
         return np.unpackbits(self.bits, axis=2, count=self.width).view(np.bool_)
 
     @property
@@ -54,7 +54,7 @@ class Grabbed:
 
 
 def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: float) -> Grabbed:
-    """Run a configured SPAD once and copy its frames. Raises what `fill` raises; the SPAD is stopped then."""
+    """Run a configured SPAD once and copy its frames. Raises what `start` and `fill` raise; stops the SPAD anyway."""
     frames = max(timing.stride // frame_bytes(spad.info.width, spad.info.height), 1)
     slots = min(max(_RING_BYTES // timing.stride, _FEWEST_SLOTS), _MOST_SLOTS, -(-n_frames // frames) + _FEWEST_SLOTS)
     ring, blocks, failed = BlockRing(slots, timing.stride), [], []

@@ -1,4 +1,4 @@
-"""The line laser. Once armed, it emits whenever the gate is high."""
+"""The line laser. While it is armed and not paused, it emits whenever the gate is high."""
 
 import logging
 from abc import abstractmethod
@@ -24,8 +24,8 @@ class LaserStatus:
     """The laser's own report, read anew each time."""
 
     emission: bool
-    """The laser emits whenever the gate is high (light = emission AND gate). False while paused or warming up; always
-    True for a laser that software cannot switch off (`LineLaser.gate_only`)."""
+    """The laser emits whenever the gate is high (light = emission AND gate). False while paused, or while it warms up
+    after `arm`; True also if another program left it about to emit, and always if it is `LineLaser.gate_only`."""
     armed: bool
     """True from `arm` to `disarm`, pauses included."""
     interlock_closed: bool | None
@@ -89,7 +89,7 @@ class LineLaser(Device):
 
     def pause(self) -> None:
         """Stop emission in a way that needs no key to resume. Allowed until `close`, also if the laser is not armed.
-        If the laser is `gate_only`, nothing changes.
+        If the laser is `gate_only`, its light does not change.
 
         May be called from any thread, even while another one arms: the interrupted `arm` must leave the laser dark.
         """
@@ -100,8 +100,8 @@ class LineLaser(Device):
             self._state = DeviceState.CONFIGURED
 
     def disarm(self) -> None:
-        """Switch emission off for good. The laser may need its key turned before it arms again. Allowed until
-        `close`. If the laser is `gate_only`, its light is not switched off."""
+        """Switch emission off. The laser may need its key turned before it arms again. Allowed until `close` and from
+        any thread. If the laser is `gate_only`, its light is not switched off."""
         self._require("disarm", *OPEN_STATES)
         _log.info("%s: disarm", self._name)
         self._do_disarm()

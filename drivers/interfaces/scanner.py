@@ -18,14 +18,14 @@ MARKER_SCAN = 2
 LEVEL_BACKWARD = 4
 """Bits of a waveform's marker words. A bit at point i is high from the start of point i for one point.
 
-A sweep begins where MARKER_SCAN rises. This marker stays high until just before the sweep's light ends. The sync source
-lets light out only while the scan marker is high. So the light ends too if the scanner stops or is unplugged, since the
-marker then falls.
+A sweep begins where MARKER_SCAN, the scan marker, rises. It stays high until just before the sweep's light ends. The
+sync source lets light out only while it is high, so the light ends too if the scanner stops or is unplugged.
+MARKER_LINE marks places within a sweep; LEVEL_BACKWARD is high throughout a sweep in the backward direction.
 """
 
 _SLOWER = "make the command slower or smaller (in a scan: raise exposures or narrow command_range)"
 _ROUNDING = 1e-6
-"""Share by which a computed speed may exceed its limit: differences of float64 commands are that uncertain."""
+"""Share by which a computed value may exceed its limit: differences of float64 commands are that uncertain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ class BeamScanner(Device):
         self._state = DeviceState.RUNNING
 
     def stop(self) -> None:
-        """Bring the mirror to rest; the waveform stays loaded. Does nothing if none is being played. Allowed
+        """Bring the mirror to rest; the waveform stays loaded. Does nothing if no waveform is being played. Allowed
         from any thread.
         """
         self._require("stop", *OPEN_STATES)

@@ -2,8 +2,8 @@
 
 It may send only a part of each row: a window that moves with the laser line. The windows stand in a table on the
 device. The device steps through the table by the scanner's markers and never by counting frames: a scan marker selects
-entry 0 of the next sweep, line marker j entry j. A frame has one window, fixed at its start; a marker that arrives
-during a frame moves the window of the next one.
+entry 0 of the next sweep's windows, the j-th line marker after it entry j (j = 1, 2, ...). A frame has one window,
+fixed at its start; a marker that arrives during a frame moves the window of the next frame.
 
 A run in this module is one start of the SPAD, from `start` to the last frame or to `stop`.
 """
@@ -133,7 +133,7 @@ class SpadInfo:
     """Pixels per row of the frames delivered, which are turned upright."""
     height: int
     rotation_deg: int
-    """Degrees counter-clockwise by which the driver turns the sensor's frames. Frames delivered are upright already."""
+    """Degrees counter-clockwise by which the driver has turned the sensor's frames before it delivers them."""
     max_frame_rate_hz: Fraction
     burst: BurstMode | None
     """None: the sensor cannot store a run."""
@@ -144,7 +144,7 @@ class SpadInfo:
     markers: bool
     """Whether frame records carry the markers of scanner and gate."""
     trigger_modes: tuple[str, ...]
-    """Ways to start an exposure: "free" (one follows the other), "external" (a pulse on the trigger input)."""
+    """Ways to start an exposure: "free" (at the device's own rate), "external" (a pulse on the trigger input)."""
     can_wait: bool = False
     """Whether the SPAD can pause while the ring is full, as a simulation or a stored burst can. A sensor that streams
     cannot."""
@@ -152,7 +152,7 @@ class SpadInfo:
 
 @dataclass(frozen=True, slots=True)
 class SpadRequest:
-    """The frames that a plan asks of a SPAD array."""
+    """The frames that a SPAD array is asked for."""
 
     frame_rate_hz: Fraction
     exposure_s: float
@@ -216,8 +216,8 @@ class SpadArray(Device):
         self._mode: SpadMode | None = None
         self._run_opened = False
         self.on_wait: Callable[[float], None] | None = None
-        """Callback within `fill`. Its argument is the time in seconds, since the last frames, for which the device was
-        asked for frames and gave none. A driver that cannot tell never calls it."""
+        """Function that `fill` calls, unless None, while no frames come. Its argument is the number of seconds for
+        which the device has been asked for frames since it last gave some. A driver that cannot tell never calls it."""
 
     @property
     @abstractmethod
@@ -276,7 +276,7 @@ class SpadArray(Device):
         self._state = DeviceState.RUNNING
 
     def fill(self, ring: BlockRing, timeout_s: float) -> bool:
-        """Claim, fill and publish a block or more. True while more may come, False once the run has ended.
+        """Claim, fill and publish a block or more. Returns True while more may come, False once the run has ended.
 
         Called on the application's source thread; waits at most `timeout_s` for frames, then raises `DeviceTimeout`. If
         the ring is full and `ring.waits` is true, a source that can wait waits for room, with the same time limit. Any
@@ -294,7 +294,7 @@ class SpadArray(Device):
         return more and self._state is DeviceState.RUNNING
 
     def stop(self) -> None:
-        """End the run. Frames not yet published are dropped and counted as lost. Does nothing without a run."""
+        """End the run. Frames exposed but not published are dropped and count as lost. Does nothing without a run."""
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:
             _log.info("%s: stop", self._name)
@@ -312,9 +312,9 @@ class SpadArray(Device):
     ) -> Grabbed:
         """Take `n_frames` whole frames and return them in memory, with the numbers of those that were lost.
 
-        frame_rate_hz: None for the highest with this exposure. exposure_s: None for the longest in a frame. mode: None
-        for a stream where the sensor and its link can, else a burst. timeout_s: longest wait for frames. Raises
-        `LimitExceeded` for what the device cannot do, `DeviceTimeout` if no frames come.
+        frame_rate_hz: None means the highest with this exposure. exposure_s: None means the longest that a frame
+        allows. mode: None means a stream if sensor and link can do that, else a burst. timeout_s: longest wait for
+        frames. Raises `LimitExceeded` for what the device cannot do, `DeviceTimeout` if no frames come.
         """
         info = self.info
         rate = info.max_frame_rate_hz if frame_rate_hz is None else Fraction(frame_rate_hz)

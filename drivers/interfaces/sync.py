@@ -27,8 +27,8 @@ class Pulse:
     """One word of a program: levels of the outputs (OR of `OUT_*`), and their duration.
 
     duration_s: if None, as long as the scan marker is low, so that the word waits for a sweep.
-    held: the gate stays high only as long as the scan marker does; the source checks that every `HOLD_S`. If a scanner
-    stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
+    held: the gate stays high only while the scan marker is high, which the source checks at least every `HOLD_S`. If a
+    scanner stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
     """
 
     outputs: int
@@ -116,7 +116,7 @@ class SyncSource(Device):
 
     def abort(self) -> None:
         """Take all outputs low; the program stays loaded. Allowed until `close` and from any thread. Raises
-        `DeviceFault` if one reads back high or they cannot be read.
+        `DeviceFault` if an output reads back high or they cannot be read.
         """
         self._require("abort", *OPEN_STATES)
         _log.info("%s: abort", self._name)

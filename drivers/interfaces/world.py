@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class SweepTruth:
-    """The truth of one sweep, against which a finished estimate is judged.
+    """The truth of one sweep, against which a finished estimate is judged. A column is one position of the laser line.
 
-    x_px: float32 (rows, columns), true stripe position per image row and column, raw pixels; NaN = no stripe.
+    x_px: float32 (rows, columns), true stripe position in each image row, in pixels of the raw image; NaN = no stripe.
     depth_m: float32 (rows, width), true z per camera pixel; NaN = nothing there.
     """
 

@@ -1,4 +1,4 @@
-"""Line lasers on serial ports: Cobolt and OBIS.
+"""Line lasers: Cobolt, OBIS and iBeam on serial ports, and `ttl`, one that is switched by hand and gated.
 
-A driver makes a `drivers.interfaces.LineLaser` from its device's config. `serial_laser` holds what the drivers share.
+A driver makes a `drivers.interfaces.LineLaser` from its device's config. `serial_laser` has the base of serial ones.
 """

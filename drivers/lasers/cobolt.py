@@ -7,15 +7,15 @@ and reports fault 1.
 
 There are two command languages, that of the first 06-MLD lasers and a SCPI-like one. Which of them a laser speaks is
 asked and not taken from its model number, since an 06-MLD comes with either firmware. A 06-DPL is refused, since its
-power follows a gate only up to about 1 kHz. Not every unit knows every question: what is asked about key and autostart
-and is refused counts as unknown.
+power follows a gate only up to about 1 kHz. Not every unit knows every question: state of key or autostart counts as
+unknown if the question is refused.
 
-`pause` must not need the key afterwards, as `l0` does (pycobolt issue 6). It blanks the light as the makers do: by
-`las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 06-MLD that knows no `l0r` goes to constant
-current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what the next
-program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as dark,
-`pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must then
-be turned off and on before the laser starts again.
+`pause` must not need the key afterwards, as `l0` (off) does (pycobolt issue 6). It blanks the light as the makers do:
+by `las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 06-MLD that knows no `l0r` goes to
+constant current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what
+the next program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as
+dark, `pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must
+then be turned off and on before the laser starts again.
 """
 
 import logging
@@ -76,7 +76,8 @@ class CoboltFraming:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """The words of one of the laser's command languages. A pair: a command without its value, and its query."""
+    """The words of one of the laser's command languages. Those in `digital`, `analog` and `set_power` lack their
+    value."""
 
     mode: str
     """Query of the mode; the answer has the form `mode_form`."""
@@ -194,7 +195,7 @@ class CoboltLaser(SerialLaser):
         self._autostart = autostart
         self._tells_key = autostart is not False
         self._pauses = dialect.pauses
-        """Those that the laser knows or may know."""
+        """The pairs of `Dialect.pauses` that the laser knows or may know."""
         self._knows_pause = dialect.pauses_any_time
         self._blanked = False
         """Whether the light was blanked and that was not ended yet."""
@@ -264,7 +265,7 @@ class CoboltLaser(SerialLaser):
         return "mixed" if digital else "analog" if analog else "modulation without input"
 
     def _power_w(self, mode: str) -> float | None:
-        """The power in watts that is set in this mode. None: the mode has no set power (constant current above 0)."""
+        """The power in watts set in this mode; 0 at a constant current of 0. None: the mode has no set power."""
         no_current = self._dialect.no_current
         if no_current is not None and mode == no_current[3]:
             with suppress(CommandRefused):
@@ -330,7 +331,7 @@ class CoboltLaser(SerialLaser):
         """Blank the light, and set the power to 0 in every mode that has one, at once and without the key. Returns
         whether the mode is still the one that it was.
 
-        on: whether the laser may be on; one that is off is only blanked if it is sure to obey the end of that later.
+        on: whether the laser may be on; one that is off is blanked only if its dialect has `pauses_any_time`.
         What is sure to be obeyed comes first: this may be an emergency. The next program can read the powers back.
         """
         to_blank = on or self._dialect.pauses_any_time
@@ -362,7 +363,7 @@ class CoboltLaser(SerialLaser):
         return False
 
     def _end_blanking(self, *, on: bool) -> None:
-        """Let the light out again. on: whether the laser was on before it was armed."""
+        """Let the light out again. on: whether the laser was on before it was armed; else a refusal is only logged."""
         try:
             self._line.tell(self._pauses[0][1])
         except CommandRefused:
@@ -382,7 +383,8 @@ class CoboltLaser(SerialLaser):
         self._line.tell_and_check(enter, self._dialect.mode, self._dialect.mode_form, mode.__eq__)
 
     def _start(self) -> None:
-        """Switch on; emission follows once temperatures are reached."""
+        """Switch on; emission follows once temperatures are reached. Raises `DeviceFault` if the laser waits for its
+        key."""
         if self._autostart is None:
             try:
                 self._line.tell("@cob1")

@@ -6,10 +6,10 @@ those of other clients.
 The light is the sum of the channels. Channel 2 is the working level and the only one that the gate switches; channel 1
 is a bias that shines whatever the gate does. So every other channel is set to a level of 0, which is read back, and
 channel 2 gets its power last, once `sta ext` says that the input has control. `laser on` may bring back other channels
-than before, so they are looked at again after it. FINE would move the power to channel 1 and is switched off.
+than before, so they are looked at again after it. The mode FINE would move the power to channel 1 and is switched off.
 
-Neither key nor interlock can be asked: both are None in `status`. An armed laser that is found off, or with light that
-the gate does not switch, reports a fault. `pause` is `laser off`, read back; no key is needed afterwards. `disarm` also
+Neither key nor interlock can be asked: both are None in `status`. `status` reports a fault if an armed laser is off, or
+has light that the gate does not switch. `pause` is `laser off`, read back; no key is needed afterwards. `disarm` also
 sets channel 2 to 0.
 
 The driver needs echo and prompt off and the usual amount of talk. Opening the laser sets this; `close` puts echo and
@@ -45,7 +45,7 @@ CLIP = re.compile(r"PASS|GOOD|FAIL")
 MOST = re.compile(r".*\bPmax: *(\d+(?:\.\d+)?) *mW\b.*")
 TEXT = re.compile(r".*")
 USUAL_TIMING = LineTiming(gap_s=0.05)
-"""Sooner after an answer than 50 ms, a command may be answered in the place of another one."""
+"""A command less than 50 ms after an answer may get the answer to another one."""
 
 _ERROR = re.compile(r"%SYS-[WEF]\b.*")
 _ACKNOWLEDGED, _NOTE, _PROMPT = "[OK]", "%SYS-I", b"CMD>"
@@ -56,7 +56,7 @@ _QUIET_S, _SAID_S = 0.1, 1.0
 """Silence that ends an answer of unknown form, and the longest wait for it."""
 _UNIT_W = {"m": 1e-3, "u": 1e-6}
 _STEP_W = 1e-6
-"""Levels are told in mW with three decimals."""
+"""Step of the levels, which the laser tells in mW with three decimals."""
 _GATED = "digital"
 """Input mode in which only the gate switches the light."""
 _WORKING = 2
@@ -75,8 +75,8 @@ class IbeamFraming:
         """Whether they were on when the port was opened."""
 
     def prepare(self, port: SerialPort) -> None:
-        """Switch echo and prompt off, whatever state they are in, and note that state. Raises `DeviceFault` if the
-        laser answers each command with the reply to the last one."""
+        """Switch echo and prompt off, whatever state they are in, and note that state. If the laser answers each
+        command with the reply to the one before, tells it to switch off and raises `DeviceFault`."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
         self.echo, self.prompt = b"echo off" in echoed, _PROMPT in said + echoed
@@ -119,14 +119,13 @@ def _say(port: SerialPort, command: str) -> bytes:
 
 
 class IbeamConfig(SerialLaserConfig):
-    """Config of a Toptica iBeam smart laser. `serial_number` is the last part of what `show serial` says, or all."""
+    """Config of a Toptica iBeam smart laser. `serial_number` is what `show serial` says, or its last part."""
 
     kind: Literal["ibeam"] = "ibeam"
 
 
 class IbeamLaser(SerialLaser):
-    """An iBeam smart with pulse board. `arm` waits up to 10 s for it to come on; a pause from another thread ends
-    that."""
+    """An iBeam smart with pulse board. `arm` waits up to 10 s for it to come on, or until another thread pauses it."""
 
     def __init__(self, line: Dialogue, framing: IbeamFraming, name: str, limits: LaserLimits) -> None:
         super().__init__(name, line, limits)
@@ -190,7 +189,7 @@ class IbeamLaser(SerialLaser):
             return None
 
     def _input_mode(self) -> str:
-        """Name of the input or mode that controls the light. It is "digital" only if no channel shines besides."""
+        """Name of the input or mode that controls the light. It is "digital" only if no other channel has power."""
         if self._line.ask("sta ext", SWITCH) != "ON":
             return "constant power"
         bias_w = sum(abs(level_w) for channel, level_w in self._levels().items() if channel != _WORKING)
@@ -236,7 +235,7 @@ class IbeamLaser(SerialLaser):
         self._told_on = True
 
     def _gate(self) -> None:
-        """Enable the bias and the working channel, and the input. A channel cannot be enabled while the input is."""
+        """Enable the bias and the working channel, then the input: while it is enabled, no channel can be."""
         line = self._line
         for channel in (1, _WORKING):
             question = f"status channel {channel}"
@@ -294,7 +293,7 @@ class IbeamLaser(SerialLaser):
 
 
 def _levels(reply: str) -> dict[int, float]:
-    """The power in W that is set for each channel."""
+    """The power that is set, in W, by channel."""
     return {int(found[1]): float(found[2]) * _UNIT_W[found[3]] for found in LEVEL.finditer(reply)}
 
 
@@ -325,7 +324,7 @@ def _identify(config: IbeamConfig, framing: IbeamFraming, line: Dialogue) -> Ibe
 
 
 def _require_normal(where: str, line: Dialogue) -> None:
-    """Refuse a laser without an input for the gate, and one that another program left in another mode."""
+    """Raise `DeviceFault` for a laser without an input for the gate, or in another mode; warn if it does not say."""
     for said in line.ask("sh sys", TEXT).split(_SEPARATOR):
         if "SPP modes" in said and "CW (On2)" in said:
             raise DeviceFault(
@@ -350,7 +349,7 @@ def _most_w(line: Dialogue) -> float:
 
 def _off(config: IbeamConfig) -> bytes:
     """The bytes that switch off. No line end goes before them: it would count as a command, and after two at once the
-    replies may come late. What a program that died had begun to send spoils the first of them, not the next."""
+    replies may come late. What a program that died had begun to send spoils the first of them; they are sent twice."""
     return b"laser off\r\n"
 
 

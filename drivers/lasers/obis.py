@@ -6,12 +6,13 @@ AllenNeuralDynamics/obis-laser debc218. The limits of the base plate's temperatu
 `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 `AM:STAT ON` sent during warm-up is deferred, and light may come minutes later. So `arm` waits until the laser is ready
-and only then sends ON; if the wait ends in any other way it sends OFF. The lasers whose words are known say standby
-once they could emit, and never "ready": both count. In CDRH mode emission begins 5 s after ON. Modes
-cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is needed to
-resume. `disarm` does the same and sets the least power. With the handshake off, a set command gets no answer at all. So
-the handshake is read first and never changed, and every setting is read back. Autostart is switched off by the first
-`arm`, so that the laser does not come on by itself at its next power-up; `close` puts it back once the laser is off.
+and only then sends ON; if the wait ends in any other way it sends OFF. The lasers whose status words are known report
+standby once they can emit, and never ready: either bit counts. In CDRH mode (a safety delay) emission begins 5 s after
+ON. Modes cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is
+needed to resume. `disarm` does the same and sets the least power. With the handshake (`OK` after each command) off, a
+set command gets no answer at all. So it is read first and never changed, and every setting is read back. The first
+`arm` switches autostart off, so that the laser stays off at its next power-up; `close` puts it back once the laser is
+off.
 """
 
 import re
@@ -102,7 +103,7 @@ class ObisFraming:
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command. Without handshake a set command has none and counts as done; callers read it back."""
+        """The reply; "" if its `OK` is missing. Without handshake a set command has none and counts as done."""
         if not command.endswith("?"):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -163,7 +164,7 @@ _DIGITAL = ("DIG", "DIGITAL")
 _MODES = {"CWP": "constant power", "CWC": "constant current"}
 _READY_POLL_S = 0.5
 _DARK_S, _DARK_POLL_S = 0.5, 0.05
-"""Longest time for the emission bit to clear after OFF, and between two looks at it."""
+"""Longest time for the emission bit to clear after OFF, and time between two looks at it."""
 
 
 class ObisConfig(SerialLaserConfig):
@@ -254,7 +255,7 @@ class ObisLaser(SerialLaser):
         self._armed = True
 
     def _prepare(self) -> None:
-        """Switch off, and set up the laser so that only the gate controls the light, now and after power-up."""
+        """Switch off, and set up the laser so that only the gate controls the light and power-up brings none."""
         self._switch_off()
         self._switch("SYST:CDRH", "ON")
         for setting in (_AUTOSTART, _PROMPT):

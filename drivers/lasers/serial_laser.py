@@ -51,14 +51,14 @@ _ANY = re.compile(".*")
 
 
 class _Light:
-    """Whether a laser may shine. It does not refer to the laser, which may be forgotten."""
+    """Whether a laser may shine. This does not refer to the laser, which may be deleted without a close."""
 
     may_shine = False
 
 
 def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: int) -> None:
-    """End the light of a laser that may shine and is not watched any more. process: number of the laser's process; in
-    another one, which was forked from it, nothing is done."""
+    """Close the port of a laser that is closed or deleted; first switch it off by the bytes `off` if it may shine. Only
+    logs errors. process: number of the laser's process; in another one, which was forked from it, nothing is done."""
     if os.getpid() != process:
         return
     if light.may_shine:
@@ -136,8 +136,8 @@ class SerialLaser(LineLaser):
         return self._line.port.lost
 
     def watch_for_end(self, off: bytes) -> None:
-        """Have the light ended if the laser is deleted, or the program ends, before `close`, or if `close` could not
-        pause it. off: bytes that switch it off in any state."""
+        """See to it that the light ends if the laser is deleted, or the program ends, before `close`, or if `close`
+        could not pause it. off: bytes that switch it off in any state."""
         self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, os.getpid())
 
     def _do_close(self) -> None:
@@ -162,8 +162,8 @@ def open_laser(
     """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
     make: name of the make in messages. off: bytes that switch the laser off in any state. prepare: called with the
-    open port first, for a laser whose replies may have another form than `framing` reads. Raises `DeviceNotFound` if
-    nothing of that make answers, and what `SerialPort` and `identify` raise.
+    open port first, for a laser whose replies may have another form than `framing` reads. identify: makes the laser.
+    Raises `DeviceNotFound` if nothing of that make answers, and what `SerialPort`, `prepare` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
     try:

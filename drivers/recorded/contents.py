@@ -3,8 +3,8 @@
 The index `frames.idx` has a header of 64 bytes, then a record of 64 bytes for each block, in the order of writing. Each
 record has its own CRC, so a torn or damaged one is recognised and affects no other. A record is used if its CRC is
 right, its place exists, and no other record claims the same bytes. Stretches that no record covers are searched for
-blocks. If the first or last block of any segment differs from its record, the index is ignored and all segments are
-searched. `find_blocks` reads no payloads.
+blocks. If the first or last block that the index has for a segment is not there, the index is ignored and all
+segments are searched. `find_blocks` checks no payloads.
 
 The index only tells where to look. The blocks themselves hold everything, so a lost index can be rebuilt from them
 (`rig repair`).
@@ -43,8 +43,8 @@ INDEX_RECORD: Final = np.dtype(
     ]
 )
 """The place of a block: number of its segment, offset and length in bytes (header to trailer, without the zeros behind
-it); and its contents, as its header has them: flags, run_id, block_seq (low 32 bits), first_frame, n_frames, sweep and
-t0_ticks of the first frame. reserved: 0. crc: CRC-32 (zlib) of the 60 bytes before."""
+it); and its contents, as its header has them: flags, run_id, block_seq (low 32 bits), first_frame, n_frames (whole ones
+only), sweep and t0_ticks of the first frame. reserved: 0. crc: CRC-32 (zlib) of the 60 bytes before it."""
 
 _HEADER: Final = struct.Struct("<4sHHI48xI")
 _RECORD: Final = struct.Struct("<IIQQIIQIIQII")
@@ -63,7 +63,7 @@ def index_header() -> bytes:
 
 def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = None) -> bytes:
     """The 64-byte record of a block at byte `offset` of `segment`. length: bytes from header to trailer; None: those
-    that the header gives.
+    of the block as `drivers.spb1` writes it.
     """
     header = block.header
     length = length or BlockLayout(block.n_frames, header.width, header.height).block_bytes
@@ -73,7 +73,7 @@ def index_of(block: FrameBlock, segment: int, offset: int, length: int | None = 
 
 
 def _signed(record: bytes) -> bytes:
-    """The record with the CRC of all bytes before as its last field."""
+    """The record with its last field set to the CRC of all bytes before it."""
     bare = record[: -_CRC.size]
     return bare + _CRC.pack(zlib.crc32(bare))
 
@@ -118,8 +118,8 @@ class Contents:
 
 
 def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
-    """The blocks of a recording. Damage raises nothing: it is listed in `problems`. Only damaged blocks, and blocks
-    that contradict others (`in_order`), are missing.
+    """The blocks of a recording, without those that are damaged or of an unsupported kind or that contradict others
+    (`in_order`). Damage raises nothing: it is listed in `problems`.
     """
     by_number = {segment.number: segment for segment in segments}
     problems: list[str] = []
@@ -146,7 +146,7 @@ def find_blocks(segments: Sequence[SegmentReader], folder: Path) -> Contents:
 
 
 def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
-    """The block that an entry describes, payload checked. Raises a ProtocolError if it is not sound there."""
+    """The block that an entry describes, payload checked. Raises a ProtocolError if no such sound block is there."""
     block = _block_at(segment, entry, check_payload=True)
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")
@@ -181,7 +181,7 @@ def _told(folder: Path, problems: list[str]) -> Entries | None:
 
 
 def _inside(records: Entries, segments: dict[int, SegmentReader], problems: list[str]) -> Entries:
-    """The records whose blocks can be there. If two records claim the same bytes, both are left out."""
+    """The records whose place and numbers are possible. If two records claim the same bytes, both are left out."""
     sizes = np.zeros(max(segments) + 2)
     sizes[list(segments)] = [segment.size for segment in segments.values()]
     room = sizes[np.minimum(records["segment"], len(sizes) - 1)]

@@ -1,8 +1,8 @@
 """The commands in recorded control traffic that make a device do something, without the queries between them.
 
-Queries are left out because their number, and the numbered lines with which the PrawnDO driver frames a command, depend
-on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line count
-once. The queries known here are those of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+Queries and the numbered lines with which the PrawnDO driver frames a command are left out, because how many there are
+depends on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line
+count once. This module knows the queries of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
 """
 
 import re
@@ -16,7 +16,7 @@ from drivers.transports.tap import OUT, Passed
 _SERIAL = "serial"
 _LINE_END = re.compile(rb"[\r\n]")
 _QUESTION = re.compile(rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}|0 0|end|ndb")
-"""Also the lines by which a PrawnDO leaves what another client had begun: they change nothing that is played."""
+"""Queries, and the lines by which a PrawnDO leaves what another client had begun, which change nothing it plays."""
 _USB_QUESTIONS = {
     "06": (0x03, 0x04, 0x05),  # Helios: status, version, name
     "01": (0x83, 0x84, 0x87, 0x88, 0x89, 0x8A, 0x8B, 0x8C),  # LaserCube: rates, range, ring, version
@@ -85,7 +85,7 @@ def _once(words: list[Passed]) -> list[Passed]:
 
 
 def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed]]:
-    """The buffers sent during each scan that came to its end; without a sync source, all buffers as one scan."""
+    """The buffers sent during each scan that was ended; without a sync source, all buffers, if any, as one scan."""
     if not buffers:
         return []
     if sync is None:

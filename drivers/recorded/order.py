@@ -1,6 +1,6 @@
 """The order of a recording's blocks, and which of them contradict the others. A wrong number costs only one block.
 
-Within a run the numbers of blocks, frames, ticks and sweeps all rise. If blocks contradict each other, the consistent
+Within a run the numbers of blocks, frames, ticks and sweeps never fall. If blocks contradict each other, the consistent
 set with the largest sum of weights is kept. A block weighs more if it agrees with its neighbours and with the index.
 """
 
@@ -21,8 +21,8 @@ _OF_INDEX: Final = 8
 """Weight of a block, and the weight that a record in the index adds. Each agreeing neighbour adds 1. So one block never
 outweighs two."""
 _OUTLIERS: Final = 4
-"""Blocks whose ticks (or sweeps) do not fit are left out only if they are at most one in this many. If there are more,
-the device probably counts like that, and all blocks are kept."""
+"""Blocks whose ticks (or sweeps) do not fit are left out only if they are at most one in this many, or a single one. If
+there are more, the device probably counts like that, and all blocks are kept."""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
@@ -131,7 +131,7 @@ def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
     """Indices of the chain of items with the largest sum of weights. In a chain, each item's `low` is at least the
     `high` of the item before it, and no two items have the same `group`. group: must be sorted.
     """
-    ends: list[int] = []  # last `high` of each chain so far, in rising order, and so are the sums of weights
+    ends: list[int] = []  # last `high` of each chain so far, in rising order; the sums of weights rise too
     totals: list[int] = []
     lasts: list[int] = []
     before = np.full(len(low), -1)
@@ -153,7 +153,7 @@ def _heaviest(low: Ints, high: Ints, group: Ints, weight: Ints) -> Ints:
 
 
 def _extend(ends: list[int], totals: list[int], lasts: list[int], waiting: list[tuple[int, int, int]]) -> None:
-    """Add the chains that end with the blocks of one group. A chain is left out if another one ends no later and is at
+    """Add the chains that end with the items of one group. A chain is left out if another one ends no later and is at
     least as heavy.
     """
     for end, total, last in waiting:

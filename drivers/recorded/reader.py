@@ -25,7 +25,7 @@ from drivers.recorded.order import Entries
 from drivers.recorded.segments import open_segments
 
 READERS: Final = 2
-"""Threads that read ahead. One thread checks CRCs at 4 GB/s."""
+"""Threads that read ahead."""
 BLOCKS_AHEAD: Final = 6
 READ_AHEAD_BYTES: Final = 32 * 2**20
 _ROUNDING_TICKS: Final = 1e-6
@@ -65,9 +65,9 @@ class RecordedRun:
         return int(self.entries["n_frames"].sum())
 
     def frame_at(self, seconds: float) -> int:
-        """Number of the first frame, lost ones included, that begins `seconds` or more after the run's first one;
-        `end_frame` if none does. If frames are triggered from outside: the first frame of the block that was taken at
-        that time.
+        """Number of the first frame, lost ones included, that begins `seconds` or more after the first recorded frame;
+        `end_frame` if none does. If frames are triggered from outside: the first frame of the last block that has begun
+        by then.
         """
         since = self.entries["t0_ticks"].astype(np.int64)
         since -= since[0]
@@ -90,8 +90,8 @@ class RunRecording:
     """A recording opened for reading: a run's folder or one `.spb` file. Any number of threads may read it.
 
     runs: in the order in which they were taken. problems: one line for each thing that is wrong; reading may add some.
-    Raises `DeviceNotFound` if there is no recording and `ProtocolError` if no frame of it is left, or if it is
-    compressed and zstandard is not installed.
+    Raises `DeviceNotFound` if there is no recording or it cannot be read, and `ProtocolError` if no frame of it is
+    left, or if it is compressed and zstandard is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -184,7 +184,7 @@ class RunRecording:
         return runs
 
     def _header(self, entries: Entries) -> BlockHeader | None:
-        """A header of the size and clock that most of several sound blocks have; None if no block is sound."""
+        """A header with the size and clock that most of several sound blocks have; None if no block is sound."""
         headers: list[BlockHeader] = []
         for at in _spread(len(entries)):
             with suppress(ProtocolError):
@@ -227,7 +227,7 @@ def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
 
 
 def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
-    """The first of several headers that has the most frequent size and clock."""
+    """The first of those headers that have the most frequent run id, size and clock."""
     kinds = Counter(map(_run_kind, headers))
     return max(headers, key=lambda header: kinds[_run_kind(header)])
 

@@ -31,7 +31,7 @@ FRAME_MAGIC: Final = bytes.fromhex("28b52ffd")
 MAX_FRAME_BYTES: Final = 1 << 31
 """Most plain bytes of a zstd frame, which holds one block; a table that states more is damaged."""
 MOST_RATIO: Final = 1 << 15
-"""Most plain bytes for one packed byte: a block of zstd takes 4 bytes and holds 128 KiB at most (RFC 8878)."""
+"""Most plain bytes for one packed byte: a block of zstd takes at least 4 bytes and holds at most 128 KiB (RFC 8878)."""
 _PIECE_BYTES: Final = 1 << 12
 """Bytes of a frame of unknown size that are fed to the unpacker at a time: they unpack to 128 MiB at most."""
 
@@ -53,8 +53,8 @@ class FrameTable:
 
     @classmethod
     def read(cls, data: Bytes) -> "FrameTable":
-        """Read the table of a whole file (uint8 (bytes,)). If it is damaged, make one from the frames, up to the first
-        damaged frame."""
+        """Read the table of a whole file (uint8 (bytes,)). If the table is damaged, make one from the frames, up to the
+        first damaged frame; raises `ProtocolError` if zstandard is not installed for that."""
         sizes = _stated_sizes(data)
         if sizes is None:
             sizes = np.array(list(_found_sizes(data)), np.int64).reshape(-1, 2)
@@ -75,7 +75,7 @@ class FrameTable:
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
     def places(self, frame: int) -> tuple[int, int, int, int]:
-        """The begin and end of a frame, first in the file, then in the plain segment."""
+        """Begin and end of a frame in the file, then in the plain segment."""
         return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 
@@ -166,8 +166,8 @@ class PlainSegment:
         self._bytes: Bytes = np.frombuffer(self._map or b"", np.uint8)
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Bytes from `offset` on, fewer at the end, as a view of the file; valid as long as something refers to
-        them."""
+        """`length` bytes from `offset` on, fewer at the segment's end, as a view of the file; valid as long as
+        something refers to them."""
         return self._bytes[offset : offset + length]
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
@@ -192,7 +192,7 @@ class PackedSegment:
         self.size = self._table.size
 
     def at(self, offset: int, length: int) -> Bytes:
-        """Unpacked bytes from `offset` on, fewer at the end. Raises CorruptBlock if they cannot be unpacked."""
+        """`length` bytes, unpacked, from `offset` on, fewer at the end. Raises CorruptBlock if they are damaged."""
         parts = []
         for frame in self._table.frames_at(offset, offset + length):
             _, _, start, _ = self._table.places(frame)
@@ -226,7 +226,7 @@ SegmentReader = PlainSegment | PackedSegment
 
 
 def open_segments(path: Path) -> list[SegmentReader]:
-    """The segments of a recording's folder in order, or of a single file. Raises `DeviceNotFound` if there are none."""
+    """The segments of a recording's folder in order, or of a single file. Raises `DeviceNotFound` without any."""
     files = segment_files(path)
     if not files:
         raise DeviceNotFound(f"{path} {NO_SEGMENT}")

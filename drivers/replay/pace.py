@@ -1,9 +1,9 @@
 """The clock of a replay: when each recorded frame is due, in the time of the clock that is passed in.
 
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
-waits for a call of `Pace.step` before each sweep, or before each block without scan markers. Time lost to a full
-ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at once.
-A run, in this module, is what comes after one start of the SPAD.
+waits for a call of `Pace.step` before each sweep, or, if there are no scan markers, before each block. Time lost to a
+full ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at
+once. A run, in this module, is what comes after one start of the SPAD.
 """
 
 import math
@@ -25,7 +25,7 @@ _TIMES = re.compile(r"x(\d+(?:\.\d*)?|\.\d+)")
 
 @dataclass(frozen=True, slots=True)
 class ReplayClock:
-    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are read,
+    """The clock named by the option `--clock`. speed: recorded seconds per second; None: as fast as frames are taken,
     or in steps.
     """
 
@@ -61,12 +61,12 @@ class PaceReport:
 
 
 class Pace:
-    """Lets blocks pass when they are due. Call `wait` on the source thread; `step`, `run_on` and `halt` on any
-    thread."""
+    """Lets blocks pass when they are due. `step`, `run_on` and `halt` may be called from any thread, all else from the
+    source thread."""
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
         self.speed = what.speed
-        """Recorded seconds per second; None: as fast as frames are read."""
+        """Recorded seconds per second; None: as fast as frames are taken, or in steps."""
         self._clock = clock
         self._changed = threading.Condition()
         self._steps = 0
@@ -74,7 +74,7 @@ class Pace:
         self.halted = False
         """Whether the run was stopped."""
         self.closed = False
-        """Whether the replay is closed, after which nothing waits any more."""
+        """Whether the replay is closed, so that it waits for no more steps."""
         self._origin_ns = 0
         self._late_s = _Lateness()
         self._held_ns = 0
@@ -92,7 +92,7 @@ class Pace:
         return not self._run_on
 
     def most_frames(self, period_s: Fraction) -> float:
-        """Largest number of frames in a block, chosen so that blocks come regularly at a slow clock too."""
+        """Most frames of a block, so that blocks come regularly also at a slow clock; infinite without a speed."""
         return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:
@@ -107,13 +107,13 @@ class Pace:
             self._changed.notify_all()
 
     def run_on(self) -> None:
-        """End stepping: from now on frames come as fast as they are taken."""
+        """End stepping: the other frames come as fast as they are taken."""
         with self._changed:
             self._run_on = True
             self._changed.notify_all()
 
     def halt(self) -> None:
-        """End the run: `wait` and `wait_for_step` return False."""
+        """End the run: `wait` and `wait_for_step` return False until the next `start`."""
         with self._changed:
             self.halted = True
             self._changed.notify_all()
@@ -138,7 +138,8 @@ class Pace:
         self._held_ns += held_ns
 
     def wait(self, due_s: float, timeout_s: float) -> bool:
-        """Wait until `due_s` of recorded time after the run's start. False if the timeout or `halt` comes first."""
+        """Wait until `due_s` of recorded time after the run's start; without a speed, do not wait. Returns False if the
+        timeout or `halt` comes first."""
         if self.speed is None:
             return not self.halted
         at_ns = self._due_ns(due_s, self.speed)

@@ -34,8 +34,8 @@ MANIFEST = "manifest.json"
 
 
 def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
-    """The manifest's entry on a device of a recording; None if there is none. Raises `ProtocolError` if the manifest
-    cannot be read.
+    """The manifest's entry on the device in a slot of the rig; None if there is no manifest or no such entry. Raises
+    `ProtocolError` if the manifest cannot be read.
     """
     file = recording / MANIFEST
     try:
@@ -121,7 +121,7 @@ Piece = tuple[FrameBlock, int, int]
 class Cursor:
     """A position while reading one start to its end, or up to frame `n_frames` - 1. For use by one thread at a time.
 
-    by_block: whether each block is a step of `Pace`, since there are no scan markers.
+    by_block: whether each block is a step of `Pace`, because there are no scan markers.
     """
 
     def __init__(self, recording: RunRecording, run: RecordedRun, n_frames: int | None, *, by_block: bool) -> None:
@@ -135,7 +135,7 @@ class Cursor:
         self._taken = 0
         self._by_block = by_block
         self.next_frame = 0
-        """One more than the number of the last frame that was played."""
+        """One more than the number of the last frame that was played, or dropped for want of a slot in the ring."""
         self.step_due = by_block
         """Whether the next frames wait for a step: those after a scan marker, or all frames if there are no markers."""
         self.damaged = 0
@@ -147,7 +147,7 @@ class Cursor:
         return not self._look_ahead(0)
 
     def gather(self, most: int, *, to_marker: bool) -> list[Piece]:
-        """The next consecutive frames, at most `most`. With `to_marker` they end with the first scan marker."""
+        """The next consecutive frames, at most `most`. With `to_marker` the frame of a scan marker is the last one."""
         pieces: list[Piece] = []
         n, index = 0, 0
         while n < most and self._look_ahead(index):
@@ -213,7 +213,7 @@ class ReplaySpadConfig(KindConfig):
     clock: Annotated[str, AfterValidator(lambda text: ReplayClock.parse(text) and text)] = "realtime"
     """Speed: realtime, max, step, or a multiple of real time: x4, x0.1."""
     loop: bool = False
-    """Whether to begin again after the last frame."""
+    """Whether to begin again after the last start."""
     block_frames: int | None = Field(default=None, ge=1)
     """Most frames of a block; by default as many as the scan asks for."""
 
@@ -276,7 +276,7 @@ class ReplaySpad(SpadArray):
         self._run_id = (runs[index].header.run_id + times * len(self.recording.runs)) & 0xFFFF
         self._played += 1
         self._reading = Cursor(self.recording, runs[index], n_frames, by_block=not self._info.markers)
-        self._t0_ticks = runs[index].header.t0_ticks
+        self._t0_ticks = int(runs[index].entries["t0_ticks"][0])
         self._published = self._delivered = self._lost_at_last = 0
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self.pace.start()

@@ -1,5 +1,5 @@
-"""Galvo scanners driven by the Helios and LaserCube laser DACs.
+"""Galvo scanners behind a Helios, LaserCube or Ether Dream laser DAC, or behind an NI card.
 
-Each driver is a `drivers.interfaces.BeamScanner` with an exact point clock. `dac_scanner` holds what laser DACs share;
-`galvo` has the limits of the mirror behind them, and paths that keep within these limits.
+Each driver is a `drivers.interfaces.BeamScanner`. `dac_scanner` holds what all of them share; `galvo` has the limits of
+the mirror behind the DAC, and paths that keep within these limits.
 """

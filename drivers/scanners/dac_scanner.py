@@ -1,10 +1,11 @@
-"""The common part of all beam scanners that are a galvo behind a DAC, on USB or on the network.
+"""The common part of all beam scanners that are a galvo behind a DAC: a laser DAC or an NI card.
 
-The mirror moves only when the scanner is started, stopped, parked or closed, along the paths of `galvo`. It may jump to
-the centre in two cases: when a board is opened whose mirror another program left elsewhere, and in an emergency halt. A
-run here is one motion: the way to the first point, the waveform and, if it is
-stopped, the way to rest; or only the way from one place of rest to another. A thread feeds the points to the DAC slice
-by slice. Nothing is computed in advance: a waveform of a million points repeated for hours takes only its own memory.
+The mirror moves along the paths of `galvo`, and only when the scanner is started, stopped, parked or closed. There are
+two exceptions, in which it may jump to the centre: when a scanner is opened whose mirror another program left
+elsewhere, and after a fault. Commands are drives: -1 to 1 is the DAC's range. A run here is one motion: the way to the
+first point, the waveform and, if it is stopped, the way to rest; or only the way from one place of rest to another. The
+points are fed to the DAC slice by slice, those of a waveform by a thread. Repeats are not written out: a waveform of a
+million points that is repeated for hours takes only its own memory.
 """
 
 import logging
@@ -29,11 +30,11 @@ from drivers.transports.usb_device import UsbDevice, UsbId, open_device
 _log = logging.getLogger(__name__)
 
 FULL_SCALE, CENTRE = 4095, 0x800
-"""Largest value of the 12-bit converters, and the value at which the mirror stands without power."""
+"""Largest value of the 12-bit converters, and their value at the centre, drive 0."""
 POLL_S = 0.002
 """Time between two queries of how far the board has played."""
 PATIENCE_S = 1.0
-"""Wait for a buffer to become free, beyond the time that its points take."""
+"""Longest time in which a board may make no progress, beyond the time that its points take."""
 DRIFT = 1e-3
 """Largest relative difference between a board's crystal and the host's clock."""
 _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
@@ -41,9 +42,8 @@ _NO_WAVE = ScanWaveform(np.zeros(1), np.zeros(1, np.uint8), Fraction(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSlice:
-    """Points: command float64 (n,), markers uint8 (n,), lit bool (n,), True for points of the waveform, False for
-    ramps.
-    """
+    """n successive points. command: float64 (n,), drives; markers: uint8 (n,), as in `ScanWaveform`; lit: bool (n,),
+    True for points of the waveform, False for the ways to and from it."""
 
     command: NDArray[np.float64]
     markers: NDArray[np.uint8]
@@ -54,23 +54,22 @@ class PointSlice:
 
     @property
     def steps(self) -> NDArray[np.uint16]:
-        """The commands as steps of the boards' 12-bit converters."""
+        """The commands as values of 12-bit converters, uint16 (n,), 0 to `FULL_SCALE`."""
         return np.rint((self.command + 1) / 2 * FULL_SCALE).astype(np.uint16)
 
     def level(self, bit: int) -> NDArray[np.uint8]:
-        """Values of a colour output that follows a marker."""
+        """Values of a colour output that follows a marker bit, uint8 (n,)."""
         return colour(self.markers & bit)
 
 
 def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
-    """Values of a colour output: full brightness at the points where `high` is not 0."""
+    """Values of a colour output, uint8 (n,): 255 at the points where `high` is not 0, else 0."""
     return np.where(high, 255, 0).astype(np.uint8)
 
 
 class PointSource:
     """Gives the points of a run in order: the way from rest at `position` to `end`, then a waveform that begins there,
-    `repeats` times. For use by one thread.
-    """
+    `repeats` times. For use by one thread at a time. `last` is the last command taken, at first `position`."""
 
     def __init__(
         self,
@@ -127,7 +126,7 @@ class PointSource:
         self._at, self._before, self.last = self._former
 
     def stop(self) -> None:
-        """Replace the remaining points by the shortest way to rest."""
+        """Replace the remaining points, if there are any, by the way to rest (`brake`)."""
         if self.left:
             self._way = brake(self.last, (self.last - self._before) * self._rate_hz, self._limits, self._rate_hz)
             self._at, self._end = 0, len(self._way)
@@ -143,9 +142,8 @@ class StartTime:
         self._at_s = 0.0
 
     def narrow(self, earliest_s: float, latest_s: float, at_s: float) -> float:
-        """Narrow the bounds by those of an answer that came at `at_s`; returns the time by which they contradict each
-        other, crystals' drift set aside. Above 0 the assumption is wrong.
-        """
+        """Narrow the bounds by those of an answer that came at `at_s`, after widening them by the clocks' possible
+        drift since the last one. Returns earliest minus latest time in seconds: above 0 they contradict each other."""
         slack_s, self._at_s = DRIFT * (at_s - self._at_s), at_s
         self.earliest_s = max(self.earliest_s - slack_s, earliest_s)
         self.latest_s = min(self.latest_s + slack_s, latest_s)
@@ -153,24 +151,23 @@ class StartTime:
 
 
 class DacRun(Protocol):
-    """One run on one device. Every wait in it has a time limit."""
+    """One run on one device. Every wait in it has a time limit. `begin` and `feed` may raise `DeviceError`."""
 
     source: PointSource
 
     def begin(self) -> None:
-        """Send the first points; they play at once."""
+        """Send the first points, to be played at once or as soon as a held mirror, clock or trigger allows it."""
 
     def feed(self, stopping: threading.Event) -> None:
         """Send the other points; returns when the mirror rests. Brakes once `stopping` is set."""
 
     def give_up(self) -> None:
-        """Make safe what `begin` or `feed` has left. For a run of a thread its error is told first. Raises no
-        DeviceError."""
+        """Make safe what is left of a run whose `begin` or `feed` has failed. Raises no DeviceError."""
         return
 
 
 class Dac(Protocol):
-    """An open board, whose mirror stands at the centre, drive 0. Closing it puts the mirror back there in one jump."""
+    """An open board. Closing it puts the mirror at the centre, drive 0, in one jump if it stands elsewhere."""
 
     name: str
     identity: str
@@ -180,23 +177,23 @@ class Dac(Protocol):
     highest_rate_hz: float
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The exact rate nearest to the requested one, between low and high."""
+        """The exact rate nearest to the requested one that the board can run, between low and high."""
 
     def run(self, source: PointSource, clock_hz: Fraction) -> DacRun:
         """A run of these points, at a rate that `point_clock` returned."""
 
     def check(self) -> None:
-        """Raise an error if the board does not answer. May be called from any thread."""
+        """Raise `DeviceError` if the board does not answer. May be called from any thread."""
 
     def halt(self) -> float:
-        """Stop what the board plays, in an emergency; returns the drive at which the next run is to begin."""
+        """Stop what the board plays, after a fault; returns the drive at which the mirror then rests."""
 
     def close(self) -> None:
         """Make the outputs safe and release the device."""
 
 
 class DacScanner(BeamScanner):
-    """One mirror axis. While a waveform is played, a separate thread communicates with the board."""
+    """One mirror axis. While a waveform is played, a thread feeds the board."""
 
     @classmethod
     def at(
@@ -209,7 +206,7 @@ class DacScanner(BeamScanner):
         tap: Tap | None = None,
     ) -> Self:
         """Open the board at an address on USB. alternates: alternate setting by USB interface. identify: makes the
-        `Dac` of an open device, or raises an error."""
+        `Dac` of an open device, or raises an error. Raises what `open_device` and `identify` raise."""
         usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, tap)
         try:
             return cls(identify(usb), config)
@@ -229,21 +226,21 @@ class DacScanner(BeamScanner):
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._error: DeviceError | None = None
-        """The error that ended the last run early; None: it ended by itself or was stopped."""
+        """The error that ended the last waveform, or the holding of the mirror after it; None: there was none."""
 
     @property
     def identity(self) -> str:
-        """The board's own description of itself."""
+        """The board's name and what it tells of itself."""
         return self._dac.identity
 
     @property
     def serial(self) -> str | None:
-        """Serial number of the board. The mirror behind it cannot be asked for one."""
+        """Serial number, stored name or MAC address of the board; None if none is known. Mirrors cannot be asked."""
         return self._dac.serial
 
     @property
     def limits(self) -> ScannerLimits:
-        """The config's limits. The highest point rate is that of `Dac.highest_rate_hz`."""
+        """The config's limits. The highest point rate is `Dac.highest_rate_hz`."""
         return self._limits
 
     def _do_status(self) -> ScannerStatus:
@@ -282,7 +279,7 @@ class DacScanner(BeamScanner):
         self._go(self._park)
 
     def _make_safe(self) -> None:
-        # Without its cable a board has no power or no points: nothing is left to be made safe.
+        # A lost laser DAC has no power or no points. A lost NI card keeps its levels, which nothing here can change.
         with suppress(DeviceDisconnected):
             super()._make_safe()
 
@@ -299,7 +296,7 @@ class DacScanner(BeamScanner):
             _log.warning("%s", error)
 
     def _go(self, command: float) -> None:
-        """Bring the mirror to rest at `command` by a ramp at the highest point rate."""
+        """Bring the mirror to rest at `command` by a ramp at the highest point rate, unless it rests there already."""
         clock_hz = self._do_point_clock(self._limits.point_rate_hz[1])
         run = self._dac.run(PointSource(self._rest(), command, self._limits, float(clock_hz)), clock_hz)
         if run.source.left:
@@ -321,7 +318,7 @@ class DacScanner(BeamScanner):
             raise
 
     def _feed(self, run: DacRun) -> None:
-        """Feed the device, in the thread. An error ends the run, and `status` reports it."""
+        """Feed the device, in the thread. An error ends the run, and `status` reports it or raises it."""
         try:
             run.feed(self._stopping)
             self._position = run.source.last

@@ -6,8 +6,8 @@ The board plays points from a buffer that a thread keeps filled, without frames 
 (the buffer ran empty, a stop, an emergency stop, its Ethernet link lost) it sets all colours to 0 and the mirror to the
 centre, in one jump. So a mirror that is to rest anywhere else must be held there: after each run a thread sends copies
 of the last point, all dark, at 1 kHz, until the next run or `close`. If the host dies, the points run out within
-`HOLD_S` or `buffer`, and the mirror jumps to the centre in the dark. A second generation board stops at once if its
-connection closes. The shutter output is high while the board plays, i.e. while the mirror is held, too: it keeps no
+`HOLD_S` or `buffer`, and the mirror jumps to the centre in the dark. A board of the second generation stops at once if
+its connection closes. The shutter output is high while the board plays, so also while the mirror is held: it keeps no
 light in.
 
 Whether every point was played exactly once, and at its rate, shows in the replies (`etherdream_stream`). Facts and
@@ -75,7 +75,7 @@ class EtherDreamDac:
     """An Ether Dream as a `Dac`. While it is idle, the mirror stands at the centre."""
 
     def __init__(self, config: EtherDreamConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> None:
-        """Connect, learn who the board is, and make it idle. Raises `DeviceBusy` if it plays for somebody else."""
+        """Connect, identify the board and make it idle. Raises `DeviceError`: `DeviceBusy` if it plays for others."""
         self.name = "Ether Dream"
         self.config = config
         self.clock = clock
@@ -123,7 +123,7 @@ class EtherDreamDac:
         return EtherDreamRun(self, source, clock_hz)
 
     def check(self) -> None:
-        """Check that the board answers and, if the mirror is being held, that it still is: else `DeviceFault`."""
+        """Raise `DeviceError` if the board does not answer, or the error that ended the holding of the mirror."""
         if self._fault is not None:
             raise self._fault
         if self._stream is None:
@@ -141,9 +141,8 @@ class EtherDreamDac:
         return 0.0
 
     def take_over(self) -> PointStream:
-        """Stop holding the mirror and return the stream that still holds it for `HOLD_S`; a prepared one if the board
-        is idle. Raises the error that ended the holding, if one did.
-        """
+        """Stop holding the mirror and return the stream that still holds it for up to `HOLD_S`; a prepared one if the
+        board is idle. Raises the error that ended the holding, if one did."""
         if (fault := self._let_go()) is not None:
             raise fault
         if self._stream is None:
@@ -151,7 +150,7 @@ class EtherDreamDac:
         return self._stream
 
     def hold(self, stream: PointStream, command: float) -> None:
-        """Hold the mirror at `command`, where it rests, from a thread."""
+        """Begin to hold the mirror at `command`, where it rests, by a thread."""
         self._letting_go = threading.Event()  # a new one: it is never cleared for a thread that is about to end
         run = (stream, command, self._letting_go)
         self._holder = threading.Thread(target=self._hold, args=run, name=f"{self.name} hold", daemon=True)
@@ -168,7 +167,7 @@ class EtherDreamDac:
             self._line.close()
 
     def _let_go(self) -> DeviceError | None:
-        """End the thread that holds the mirror; returns the error that ended it before."""
+        """End the thread that holds the mirror; returns the error that had ended it before, None if none had."""
         holder, self._holder = self._holder, None
         self._letting_go.set()
         if holder is not None and holder.ident is not None:
@@ -186,7 +185,8 @@ class EtherDreamDac:
             _log.error("%s", error)
 
     def _settle(self) -> None:
-        """Make the board idle and ready. What an earlier program left in its buffer is played to its end."""
+        """Make the board idle and ready, once it has played what an earlier program left in its buffer. Raises
+        `DeviceBusy` if it goes on playing or plays from a source of its own, and as `_clear`."""
         end_s = now_s(self.clock) + LEAST_CAPACITY / HOLD_PPS + PATIENCE_S
         while (reply := self._line.ask(PING)).playback == PLAYING and reply.source == 0 and now_s(self.clock) < end_s:
             self.clock.sleep(_HOLD_POLL_S)
@@ -220,7 +220,7 @@ class EtherDreamRun(DacRun):
         self._most = max(2, round(dac.config.buffer * float(clock_hz)))
         self._stream: PointStream
         self._end: int | None = None
-        """Number of points sent when the run's last one was; None: not yet."""
+        """Number of points that the stream had sent with the run's last one; None: that was not sent yet."""
 
     def begin(self) -> None:
         """Send the first points, which play behind those that hold the mirror; at once if the board is idle."""
@@ -234,9 +234,8 @@ class EtherDreamRun(DacRun):
             self._stream.begin()
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send the other points; returns when the last one was played, and a thread holds the mirror there. Brakes once
-        `stopping` is set.
-        """
+        """Send the other points; returns when the last one was played; a thread then holds the mirror there. Brakes
+        once `stopping` is set."""
         stopped = False
         while self._end is None or not self._stream.is_played(self._end):
             if not stopped and stopping.is_set():
@@ -275,10 +274,10 @@ class EtherDream(DacScanner):
         """Open an Ether Dream by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per
         second.
 
-        port: "HOST" or "HOST:PORT". max_point_rate_hz, buffer_s: the most points per second; the points queued in the
-        board. settings: axis, max_step, rms_duty, command_range, park, as in `EtherDreamConfig`. clock: for
-        emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board cannot
-        be opened.
+        port: "HOST" or "HOST:PORT". max_point_rate_hz, buffer_s: the most points per second; the duration of the points
+        queued in the board. settings: axis, max_step, rms_duty, command_range, park, as in `EtherDreamConfig`. clock:
+        for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board
+        cannot be opened.
         """
         config = config_of(
             EtherDreamConfig,

@@ -3,10 +3,10 @@
 Commands go one at a time over TCP, and each gets a reply of 22 bytes with the board's whole status; only `v` gets 32
 bytes of text. Once a second a board broadcasts a datagram with its MAC address, revisions, buffer and highest rate.
 
-A connection that was interrupted in the middle of a command, or that gave no proper reply, is closed for good: the
-firmware would take the next command for the rest of the last one. Unknown commands are never sent: they close the
-connection or stop the board. A rate above the board's highest is refused after one byte, and the rest of the command is
-then read as further commands. Facts and sources: docs/reference/devices/etherdream.md.
+A connection that was interrupted in the middle of a command, or that gave no proper reply, is closed for good: else the
+firmware might take the next command for the rest of this one, or a late reply be taken for the next. Unknown commands
+are never sent: they close the connection or stop the board. A rate above the board's highest is refused after one byte,
+and the rest of the command is then read as further commands. Facts and sources: docs/reference/devices/etherdream.md.
 """
 
 import logging
@@ -41,7 +41,7 @@ _CONNECT_S = 2.0
 _REPLY_S = 1.0
 """Deadline for a reply. An Ether Dream 2 usually takes 0.5 ms and sometimes 35 ms."""
 BROADCAST_S = 1.5
-"""Time within which a board has broadcast at least once."""
+"""Time within which a board broadcasts at least once."""
 
 
 def begin(rate_hz: int) -> bytes:
@@ -68,7 +68,7 @@ class Reply:
     light_engine: int
     playback: int
     source: int
-    """0: the network; 1: files from its SD card; 2: its own patterns."""
+    """0: the network; 1: files from the board's SD card; 2: its own patterns."""
     flags: int
     fullness: int
     """Points in the buffer. After a stop this stays as it was, until the next `PREPARE`."""
@@ -95,7 +95,7 @@ class Broadcast:
 
     @classmethod
     def read(cls, datagram: bytes) -> "Broadcast | None":
-        """The content of a datagram; None if it is none of an Ether Dream."""
+        """The content of a datagram; None if it has not the length of an Ether Dream's."""
         if len(datagram) != _BROADCAST.size:
             return None
         mac, *numbers = _BROADCAST.unpack(datagram)
@@ -103,9 +103,8 @@ class Broadcast:
 
 
 def broadcasts(wait_s: float = BROADCAST_S, port: int = BROADCAST_PORT) -> Generator[tuple[str, Broadcast], None, None]:
-    """The broadcasts that come within `wait_s`, each with its sender's numeric address. None do if another program
-    keeps the port to itself.
-    """
+    """The broadcasts that come within `wait_s`, each with its sender's numeric address. Ends early, without an error,
+    if the socket fails, as when another program keeps the port to itself."""
     ends_at = time.monotonic() + wait_s
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -119,7 +118,7 @@ def broadcasts(wait_s: float = BROADCAST_S, port: int = BROADCAST_PORT) -> Gener
 
 
 def listen(host: str) -> Broadcast | None:
-    """The next broadcast that comes from the numeric address `host`; None if none does."""
+    """The next broadcast that comes from the numeric address `host`; None if none does within `BROADCAST_S`."""
     with closing(broadcasts()) as all_heard:
         return next((heard for sender, heard in all_heard if sender == host), None)
 
@@ -129,8 +128,8 @@ class EtherDreamLine:
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
         """Connect to "host" or "host:port", and read the status that a board sends to each new client. Raises what
-        `TcpStream` raises, or `DeviceBusy`.
-        """
+        `TcpStream` raises, `DeviceBusy` if the board closes the connection at once, `DeviceTimeout` or
+        `ProtocolError`."""
         self._name, self._tap = name, tap
         self.lock = threading.RLock()
         """Held during each command. Hold it to keep other threads' commands away for longer."""
@@ -162,7 +161,7 @@ class EtherDreamLine:
         return Reply.read(self._exchange(command, _REPLY.size))
 
     def tell(self, command: bytes) -> Reply:
-        """Send one command that must be accepted. Raises `CommandRefused` if it is not, else as `ask`."""
+        """Send one command and return its reply. Raises `CommandRefused` if it is not accepted, and as `ask`."""
         reply = self.ask(command)
         if reply.code != ACCEPTED:
             raise CommandRefused(

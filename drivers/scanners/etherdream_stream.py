@@ -1,9 +1,9 @@
 """The points of an Ether Dream: their bytes, their rates, and whether all were played.
 
 Every reply has the number of points in the buffer and of those played. Their sum must be the number sent: else a point
-was lost or repeated, or another client sends points too. Firmware reads the two numbers one after the other, so the
-second may be ahead by one. Besides, the points must be played at the rate that was set: each reply bounds the time of
-the first point at a rate, and the bounds must not contradict each other. Else `DeviceFault` ends the run.
+was lost or repeated, or another client sends points too. Firmware reads the two numbers one after the other, so the sum
+may be one too high. Besides, the points must be played at the rate that was set: each reply bounds the time of the
+first point at a rate, and the bounds must not contradict each other. If either check fails, `DeviceFault` ends the run.
 
 Rates change without a pause: `q` queues a rate, and bit 15 of a point's control word makes it that point's rate. A
 point takes floor(24e6 / rate) cycles of 24 MHz: the firmware writes that quotient to the match register of an LPC1758's
@@ -38,19 +38,19 @@ from drivers.scanners.etherdream_line import (
 
 TIMER_HZ = 24_000_000
 MOST_PPS = 100_000
-"""Highest rate of all generations. A higher one would be refused after one byte, and the rest of the command read as
-emergency stops."""
+"""Highest rate of the first generation and of an Ether Dream 2. A higher one would be refused after one byte, and the
+rest of the command read as further commands, some as emergency stops."""
 MOST_POINTS = 400
 """Most points of one command. They fit into the 7500 B that the firmware takes before it acknowledges any."""
 _X_SCALE = 32_760
-"""Coordinate at drive 1. Firmware drops the lowest 4 bits of coordinate + 32768; 32 760 is the scale at which the
-12-bit value so found is the nearest one, with 0 in the centre. A 16-bit converter gets all bits."""
+"""Coordinate at drive 1. Firmware drops the lowest 4 bits of coordinate + 32768. With 32 760 the 12 bits that remain
+are the value nearest to the drive, and drive 0 is the centre. A 16-bit converter gets all bits."""
 _RATE_CHANGE, _FULL = 0x8000, 0xFFFF
 _POINT = np.dtype([(name, "<i2" if name in "xy" else "<u2") for name in ("control", *"xyrgbi", "u1", "u2")])
 _TOLERANCE_S = 0.002
 """Time by which two replies may contradict each other about when the first point was played."""
 _MOST_AHEAD = 50
-"""Replies in a row whose count of played points may be one ahead. For an honest board that is rare even once."""
+"""Most replies in a row whose count of played points is one ahead. In a sound board even one such reply is rare."""
 
 
 def pps_of(rate_hz: Fraction) -> int:
@@ -94,12 +94,12 @@ class PointStream:
         self._from = self._most = self._pps = self._first_pps = self._ahead = 0
         self._rate_hz = 1.0
         self._start = StartTime()
-        """That of the first point at the present rate."""
+        """Bounds of the time of the first point at the present rate."""
         self._moved_s = 0.0
         line.tell(PREPARE)
 
     def change_rate(self, clock_hz: Fraction, most: int) -> None:
-        """Play the points sent from here on at another rate, at most so many of them being queued at a time."""
+        """Play the points sent from here on at `clock_hz`. most: the largest number of them queued at a time."""
         pps = pps_of(clock_hz)
         self._turns = self.sent > 0 and pps != self._pps
         if self._turns:
@@ -116,13 +116,12 @@ class PointStream:
         return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
 
     def is_played(self, n: int) -> bool:
-        """Whether the first n points were played, by a last reply that speaks of no other ones."""
+        """Whether the first n points were played, by a last reply whose count was not one ahead."""
         return self.played >= n and not self._ahead
 
     def send(self, points: PointSlice) -> None:
         """Append points, no more than there is `room` for; without any, ask how far the board is. Raises `DeviceFault`
-        if any was not played as it should.
-        """
+        if points were not played as they should be, and what `EtherDreamLine.ask` raises."""
         n = len(points)
         if not n:
             self.ping()
@@ -131,8 +130,7 @@ class PointStream:
         self._turns = False
 
     def hold(self, command: float) -> None:
-        """Send as many copies as there is `room` for of the point at which the mirror rests, all dark. Raises as
-        `send`."""
+        """Send dark copies of the point at which the mirror rests, as many as there is `room` for. Raises as `send`."""
         n = self.room
         self.send(PointSlice(np.full(n, command), np.zeros(n, np.uint8), np.zeros(n, bool)))
 
@@ -175,7 +173,7 @@ class PointStream:
             self._check_rate(reply.rate_hz, asked_s, answered_s)
 
     def _check_rate(self, said_hz: int, asked_s: float, answered_s: float) -> None:
-        """Check the rate that the board says and, once some points were played at it, the one at which it plays."""
+        """Check the rate that the board states, and the one at which it plays."""
         n = self.played - self._from
         off_s = self._start.narrow(asked_s - n / self._rate_hz, answered_s - (n - 1) / self._rate_hz, answered_s)
         if said_hz != self._pps:

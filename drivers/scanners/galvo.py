@@ -1,13 +1,13 @@
-"""A galvo behind a DAC: its config, its limits, and paths between two commands that keep within them.
+"""A galvo behind a DAC: its config, its limits, and paths between two commands that keep within these limits.
 
-The paths lead to the first point, to a stop and to the dump angle:
+The paths lead to the first point of a waveform, to a stop, to where the beam is dumped and back to the centre:
 
     ramp   from a to b in time T: x(t) = a + (b - a) (1 - cos(pi t / T)) / 2
-           largest speed |b - a| pi / 2T, largest acceleration |b - a| pi^2 / 2T^2
+           largest speed |b - a| pi / (2 T), largest acceleration |b - a| pi^2 / (2 T^2)
     brake  constant deceleration from the mirror's present speed
 
-DACs pass the steps of their input to the galvo as they are, and a full-range jump at every point can overheat it
-(docs/reference/devices/helios.md). So no path contains a jump.
+DACs pass the steps of their input to the galvo unfiltered (docs/reference/devices/helios.md), and a full-range jump at
+every point can overheat it. So no path contains a jump.
 """
 
 import math
@@ -31,19 +31,19 @@ Drive = Annotated[float, Field(ge=-1, le=1)]
 
 
 class GalvoConfig(KindConfig):
-    """Limits of the galvo, from its data sheet. The DAC itself would play anything."""
+    """Port and axis of a galvo, and its limits from the data sheet: the DAC itself would play anything."""
 
     port: str = "usb"
     """Port: "usb"; if several are attached, "usb:serial=ABC" for a LaserCube or "usb:path=1-2" for a Helios, which has
     no serial number; or "emulated:NAME"."""
     axis: Literal["x", "y"] = "x"
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
-    """Largest speed of the normalised drive, whose full range is 2."""
+    """Largest change of the normalised drive per second; its full range is 2."""
     max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
     max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Largest change of the drive from one point to the next."""
     rms_duty: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Largest root-mean-square acceleration as a share of max_acceleration: the galvo's heat."""
+    """Largest root-mean-square acceleration as a share of max_acceleration. It bounds the galvo's heat."""
     command_range: tuple[Drive, Drive] = (-1.0, 1.0)
     park: Drive = -1.0
     """Drive at which the beam hits the dump; within command_range."""
@@ -82,7 +82,7 @@ def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDA
     if way == 0:
         return np.empty(0)
     velocity = min(limits.velocity_per_s, limits.step * rate_hz) * _HEADROOM
-    # The root mean square of a cosine is its peak / sqrt 2: below a duty of 0.7 that is the stricter limit.
+    # The root mean square of a cosine is its peak / sqrt 2: below a duty of 0.7 the duty is the stricter limit.
     acceleration = limits.acceleration_per_s2 * min(1.0, limits.rms_duty * math.sqrt(2)) * _HEADROOM
     least_s = max(way * math.pi / (2 * velocity), math.pi * math.sqrt(way / (2 * acceleration)))
     points = max(2, math.ceil(least_s * rate_hz))
@@ -95,15 +95,15 @@ def ramp(start: float, end: float, limits: ScannerLimits, rate_hz: float) -> NDA
 def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz: float) -> NDArray[np.float64]:
     """Commands from `position` (excluded) to rest at a constant deceleration, inside the command range. float64 (n,).
 
-    The deceleration exceeds its limit only if the command range leaves too little room. This never happens when
-    a waveform within the limits is stopped.
+    The deceleration exceeds its limit only if the command range leaves too little room. When a waveform within the
+    limits is stopped, this happens only by rounding to whole points, by a factor below 2.
     """
     step = velocity_per_s / rate_hz
     if step == 0:
         return np.empty(0)
     low, high = limits.command_range
     room = max((high - position) if step > 0 else (position - low), 0.0)
-    # Steps s (1 - k / m), k = 1 ... m - 1: each is shorter than the last by s / m; their sum is s (m - 1) / 2.
+    # Steps s (1 - k / m), k = 1 ... m - 1: each is shorter than the one before by s / m; their sum is s (m - 1) / 2.
     decrements = math.ceil(abs(step) * rate_hz**2 / (limits.acceleration_per_s2 * _HEADROOM))
     decrements = int(min(decrements, 1 + 2 * room / abs(step)))
     steps = step * (1 - np.arange(1, decrements) / decrements)

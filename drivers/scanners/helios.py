@@ -8,9 +8,9 @@ nor a clock output: synchronisation comes from the markers in the SPAD's stream.
 Every frame has the flag SINGLE (play once): if the host dies, the mirror stops after at most two frames. The shutter
 pin is never raised.
 
-The firmware writes the centre to the mirror only after STOP, in one jump. It does not when it is powered up or enabled,
-so STOP is sent when the board is opened. After that, STOP is used only in emergencies and at the end; scans end with a
-brake ramp.
+The firmware writes the centre to the mirror only after STOP or when it is disabled, in one jump. It does not when it is
+powered up or enabled, so STOP is sent when the board is opened. After that, STOP is used only in emergencies and at the
+end; a scan that is stopped ends with a brake ramp.
 
 The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
 the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
@@ -73,7 +73,7 @@ FLAG_START, FLAG_SINGLE = 1, 2
 
 
 def rate_of(pps: int) -> Fraction:
-    """The rate at which the device really runs if `pps` is requested, which is always a little slower."""
+    """The rate at which the device really runs if `pps` points per second are requested: always a little lower."""
     return Fraction(SYSTICK_HZ, SYSTICK_HZ // pps + 1)
 
 
@@ -102,11 +102,11 @@ def sendable(points: int) -> bool:
 
 
 def slice_points(left: int, most: int) -> int:
-    """Number of points of the next frame if `left` points are left. Requires that `most` is sendable, and also `left`
-    if it is not above `most`.
+    """Number of points of the next frame if `left` points are left. most: the largest frame, which must be sendable; so
+    must `left` if it is not above `most`.
 
-    The last two frames are of about equal length. If the last but one were short, it would end before the last one
-    arrives.
+    If several frames are needed, the last two are of about equal length: a short last but one would end before the last
+    one arrives.
     """
     if left <= most:
         return left
@@ -167,7 +167,7 @@ class HeliosConfig(GalvoConfig):
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=MOST_PPS)] = 65535.0
     """Most points per second. Lower it where the host's USB is busy: 40 kHz leaves a margin."""
     frame: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
-    """Longest duration of one frame: the host may be late by as much, and a stop takes twice as long."""
+    """Longest duration of one frame: the host may be late by as much, and a stop takes up to twice as long."""
 
 
 class HeliosDac:
@@ -185,7 +185,7 @@ class HeliosDac:
         self.clock = clock
         self._lock = threading.RLock()
         self._out_of_step = False
-        """Whether a reply came late or was no status: what is read next may answer an older question."""
+        """Whether a status is outstanding, late or damaged: what is read next may answer an older question."""
         clock.sleep(_SETTLE_S)
         link.drain(_REPLIES, _REPLY_BYTES, _DRAIN_S)
         (version,) = struct.unpack("<I", self._ask(_VERSION, 0x84, 4)[:4])
@@ -252,7 +252,8 @@ class HeliosDac:
             self._link.write(_COMMANDS, bytes((opcode, data)), timeout_s)
 
     def _ask(self, opcode: int, answer: int, least: int) -> bytes:
-        """The bytes after the answer's first byte. Asks twice with three reads each, as the vendor's library does."""
+        """The bytes after the answer's first one (`answer`), at least `least`. Asks up to twice, with three reads
+        each."""
         heard = b""
         with self._lock:
             for _ in range(2):
@@ -327,7 +328,7 @@ class HeliosRun(DacRun):
         self._clock.sleep(latest_s - now_s(self._clock))
 
     def _append(self, frame: bytes, duration_s: float) -> None:
-        """Send one more frame, behind the playing one. Raises `DeviceFault` if it came too late or was dropped."""
+        """Send one more frame, behind the playing one. Raises `DeviceFault` if it came too late or may be lost."""
         _, arrived_s = self._send(frame)
         late_s = arrived_s - self._earliest_end_s
         if late_s > 0:
@@ -382,7 +383,7 @@ class HeliosRun(DacRun):
             self._clock.sleep(POLL_S)
 
     def _wait_until_free(self, stopping: threading.Event | None) -> bool:
-        """Wait until the pending buffer is free; False if a stop came first. Raises errors if it never is."""
+        """Wait until the pending buffer is free; False if a stop came first. Raises `DeviceError` if it never is."""
         heard_s, full_s = now_s(self._clock), self._earliest_end_s
         while stopping is None or not stopping.is_set():
             asked_s = now_s(self._clock)

@@ -1,23 +1,23 @@
 """Scanner kind `lasercube`: a galvo behind a LaserCube / LaserDock USB board (docs/reference/devices/lasercube.md).
 
-    outputs   X (or Y): mirror. With `colours: markers` R: backward. G: line marker. B: scan marker. X is not
+    outputs   X (or Y): mirror. With `colours: markers`, R: backward. G: line marker. B: scan marker. X is not
               reversed, unlike in the vendor's program: the calibration says in which direction a command leads
 
 The board has a ring of samples that a thread keeps filled, without frames or seams. It plays the ring only while its
-output is on; while the output is off, X and Y rest at the centre. So the output is switched on for the first run and
-stays on until the board is closed, and dark points are points whose colours are 0. The colour outputs drive lasers of
-the board's own unless these are unplugged, so all points are dark until the config says where the outputs lead.
+output is on; while the output is off, X and Y rest at the centre. So the output is on from the first run until the
+board is closed or halted, and dark points are points whose colours are 0. The colour outputs drive lasers of the
+board's own unless these are unplugged, so all points are dark until the config says where the outputs lead.
 
 When the ring runs empty, X and Y keep their values and the colours go to 0. So a run ends with copies of its last
 point, and the mirror rests there. Switching the output off or clearing the ring would put the mirror at the centre in
-one jump. That is done when the board is opened, in emergencies, and when it is closed, by then at the centre. If the
-host dies, the ring runs empty within its length: the colours go dark and the mirror stands still. No other action is
-taken, so the laser's gate must not depend on this board alone.
+one jump. That is done when the board is opened, after a fault, and when it is closed, with the mirror already at the
+centre unless a run failed. If the host dies, the ring runs empty within the time that its samples take: the colours go
+dark and the mirror stands still. Nothing else happens then, so the laser's gate must not depend on this board alone.
 
 Whether each sample was played exactly once is judged from the answers to 'how many are queued'. Each answer bounds the
 time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the intervals of all
-answers must have a time in common. Samples are sent in whole transfers, so that a lost one is noticed. A run begins
-with copies of its first point, so that a sample lost before the first answer is one of them.
+answers must have a time in common, within a tolerance. Samples are sent in whole transfers, so that a loss is noticed.
+A run begins with copies of the mirror's resting point, so that a sample lost before the first answer is a copy.
 
 Sources of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp, and issue 15 (product string
 `Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md (a ring of 768 samples that is not
@@ -63,8 +63,8 @@ _COMMANDS, _REPLIES, _SAMPLES = 0x01, 0x81, 0x03
 _REPLY_BYTES = 64
 SAMPLES_PER_TRANSFER = 64
 _SPARE_SAMPLES = 8
-"""Samples of the ring that stay free: one packet of 64 B. The firmware keeps a transfer waiting that would fill the
-ring, until 64 samples are free."""
+"""Samples of the ring that stay free: one packet of 64 B. The firmware keeps a packet that would fill the ring waiting
+until 64 samples are free."""
 
 _ENABLE, _SET_RATE, _GET_RATE, _MAX_RATE = 0x80, 0x82, 0x83, 0x84
 _DAC_MIN, _DAC_MAX, _RING_SIZE, _RING_FREE, _CLEAR = 0x87, 0x88, 0x89, 0x8A, 0x8D
@@ -81,8 +81,8 @@ class LaserCubeConfig(GalvoConfig):
 
     kind: Literal["lasercube"] = "lasercube"
     colours: Literal["dark", "markers"] = "dark"
-    """Use of the colour outputs. markers: its lasers are unplugged and the outputs lead to the marker inputs. dark:
-    all are 0 at every point."""
+    """Use of the colour outputs. markers: the board's lasers are unplugged and the outputs lead to the marker inputs.
+    dark: all are 0 at every point."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=100_000)] = 30_000.0
     """Most points per second; the device may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.01, le=0.5)] = 0.06
@@ -93,11 +93,11 @@ class LaserCubeConfig(GalvoConfig):
 class LaserCubeDac:
     """A LaserCube as a `Dac`: its commands, one at a time. May be called from any thread.
 
-    The board cannot report the mirror's position. It is at the centre while the output is off.
+    The board cannot report the mirror's position. The mirror is at the centre while the output is off.
     """
 
     def __init__(self, config: LaserCubeConfig, link: UsbDevice, clock: Clock) -> None:
-        """Switch the output off, empty the ring, and ask the device about itself."""
+        """Switch the output off, empty the ring, and ask the device about itself. May raise `ProtocolError`."""
         self.name = link.label
         self.serial = link.listing.serial
         self.clock = clock
@@ -105,7 +105,7 @@ class LaserCubeDac:
         self._link = link
         self._lock = threading.RLock()
         self._out_of_step = True
-        """Whether a reply, perhaps an older program's, may be outstanding: the next may answer an older question."""
+        """Whether a reply, even an older program's, may be due: the next one may answer an older question."""
         self.safe()
         self.firmware = (self._number(_MAJOR, 1), self._number(_MINOR, 1))
         self.identity = f"{self.name}, firmware {self.firmware[0]}.{self.firmware[1]}"
@@ -158,7 +158,7 @@ class LaserCubeDac:
             raise DeviceFault(f"{self.name}: runs at {actual_hz} Hz instead of {rate_hz} Hz; choose another point rate")
 
     def queued(self) -> int:
-        """Number of samples in the ring that were not played yet."""
+        """Number of samples in the ring that were not played yet. Raises `ProtocolError` if it cannot be right."""
         free = self._number(_RING_FREE)
         if free > self.ring_points:
             raise ProtocolError(f"{self.name}: {free} of {self.ring_points} samples free; check the cable")
@@ -203,7 +203,7 @@ class LaserCubeDac:
 
 
 def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
-    """The bytes of samples. With markers: R backward, G line marker, B scan marker. Without, all colours are dark."""
+    """The 8 bytes of each sample. With markers: R backward, G line marker, B scan marker; without, all are dark."""
     samples = np.full((len(points), 4), CENTRE, "<u2")
     samples[:, :2] = 0
     if markers:
@@ -214,11 +214,11 @@ def encode(points: PointSlice, axis: str, *, markers: bool) -> bytes:
 
 
 _HOLD_S = 0.03
-"""Shortest time for which the first and the last point are held, if the ring is long enough. The host may be this late
-with its first and its last query."""
+"""Shortest time for which the mirror is held before the first and at the last point, if the ring is long enough. The
+host may be this late with its first and its last query."""
 _TOLERANCE_POINTS = 48
-"""Tolerance in points: less than a transfer, which gets lost as a whole; more than the device's own steps in
-counting."""
+"""Points by which answers may contradict each other: less than a transfer, which gets lost as a whole; more than the
+device's own steps in counting."""
 
 
 class LaserCubeRun(DacRun):
@@ -244,7 +244,7 @@ class LaserCubeRun(DacRun):
         self._start = StartTime()
 
     def begin(self) -> None:
-        """Send copies of the first point, which play at once, then points until the buffer is full."""
+        """Send copies of the mirror's resting point, which play at once, then points until the buffer is full."""
         self._link.set_rate(self._rate_hz)
         self._link.enable(True)
         self._send(self.source.take(self._hold))
@@ -297,7 +297,7 @@ class LaserCubeRun(DacRun):
         return max(0, self._most - queued - len(self._waiting) // 8)
 
     def _send(self, points: PointSlice) -> None:
-        """Send whole transfers; the samples left over wait for the next call."""
+        """Send whole transfers; leftover samples wait for the next call. Raises `DeviceFault` if it came too late."""
         self._waiting += encode(points, self._axis, markers=self._markers)
         whole = len(self._waiting) // (8 * SAMPLES_PER_TRANSFER) * 8 * SAMPLES_PER_TRANSFER
         self._link.send(self._waiting[:whole])
@@ -345,10 +345,10 @@ class LaserCube(DacScanner):
     ) -> "LaserCube":
         """Open a LaserCube by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
 
-        port: as in `GalvoConfig`. max_point_rate_hz, buffer_s: the most points per second; the samples queued in the
-        device. settings: axis, max_step, rms_duty, command_range, park, colours, as in `LaserCubeConfig`. clock,
-        usb_backend: for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if
-        the board cannot be opened.
+        port: as in `GalvoConfig`. max_point_rate_hz, buffer_s: the most points per second; the duration of the samples
+        queued in the device. settings: axis, max_step, rms_duty, command_range, park, colours, as in `LaserCubeConfig`.
+        clock, usb_backend: for emulators. Raises `LimitExceeded` for a setting that is not possible, other
+        `DeviceError` if the board cannot be opened.
         """
         config = config_of(
             LaserCubeConfig,

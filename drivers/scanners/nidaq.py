@@ -3,22 +3,23 @@
     outputs   aoN: mirror, drive -1 to 1 as -full_scale to full_scale. port0/line0: line marker. line1: scan marker.
               line2: backward. All change with the same sample clock
 
-The card is in this computer, or at a computer that runs NI's gRPC device server. Each run has an AO task and a DO task,
-both buffered, continuous and without regeneration. The DO task is clocked by the AO sample clock and started first, so
-that sample i of both leaves with the same edge. The run is fed slice by slice, `buffer` ahead of what the card says it
-has generated. If the buffer runs dry, the card stops with an error, never with old points.
+The card is in this computer, or at a computer that runs NI's gRPC device server. A run has a task for the analogue
+output (AO) and, if it plays a waveform and markers have lines, one for these digital outputs (DO). Both are buffered,
+continuous and without regeneration (the buffer is not repeated). The DO task is clocked by the AO sample clock and
+started first, so that sample i of both leaves with the same edge. The run is fed slice by slice, `buffer` ahead of what
+the card says it has generated. If the buffer runs dry, the card stops with an error, never with old points.
 
 After its points a run goes on with copies of the last one, markers low, until the card has generated the last point;
 then the tasks are stopped in the middle of the copies. A stopped output keeps its last level, and so does a cleared one
-and one whose buffer ran dry. So every way out of a run writes the marker lines low. It cannot if the host dies, or the
-connection to the server: then the markers stay as they are, and the laser's gate must not depend on this card alone.
+and one whose buffer ran dry. So every way out of a run takes the markers low. If the host dies or the connection to the
+server is lost, that fails and they stay as they are: the laser's gate must not depend on this card alone.
 
-`start` first turns the mirror to the first point, by the card's own clock. Only then is the waveform armed, with the
-clock, triggers and exports of the config. So its point 0 is the first sample clock after the start trigger.
+`start` first turns the mirror to the first point, by the card's own clock, then arms the waveform with the config's
+clock, triggers and exports. Its point 0 is the first sample clock after the start trigger, with counters the second.
 
-An output can be written, not read. Most cards with analogue inputs measure it on an internal channel, though. There,
-opening brings a mirror that stands elsewhere to the centre along a ramp, and after a failed run it stays where it is.
-Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
+An output can be written, not read. Most cards with analogue inputs measure it on an internal channel, though. Such a
+card brings a mirror that stands elsewhere to the centre along a ramp when it is opened, and leaves it where it is after
+a failed run. Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
 """
 
 import logging
@@ -56,18 +57,18 @@ _log = logging.getLogger(__name__)
 _WRITE_S = 1.0
 _POLL_S = 0.01
 _MEASURED_V = 10.0
-"""Range in which outputs are measured; there are none beyond."""
+"""Outputs are measured from minus this to this voltage; none goes beyond."""
 _LEAST_QUEUED = 64
 """Fewest samples queued in a run."""
 _CENTRED = 0.005
-"""Difference of a measured drive that counts as none: 50 mV of 10 V, more than any card's error."""
+"""Smaller differences of a measured drive count as none: 50 mV of 10 V, more than any card's error."""
 _LINE = "port0/line"
 _PATIENT = 0.6
-"""Share of the buffer that a call may take while a waveform is played."""
+"""Share of the buffer's duration that a call may take during a run."""
 _NEVER = 2**30
 """Edges before a pulse that is not to come."""
 _COUNTER_LEAD = 1
-"""Points at rest before a waveform with counters: their first edge is 2 clocks after their start or later."""
+"""Points at rest before a waveform with counters, whose first edge comes 2 clocks after their start or later."""
 
 _KEYS = {MARKER_LINE: "line_marker", MARKER_SCAN: "scan_marker", LEVEL_BACKWARD: "backward_marker"}
 
@@ -91,7 +92,7 @@ class NidaqConfig(GalvoConfig):
     scan_marker: MarkerOutput | None = "port0/line1"
     backward_marker: MarkerOutput | None = "port0/line2"
     """Output of each marker; null: not wired. port0/lineN: a line with a clock. ctrN: a counter, for cards without such
-    lines; it can only do a marker that is periodic over the whole waveform."""
+    lines; it can only make a marker that is periodic over the whole waveform."""
     counted_at: Terminal | None = None
     """Terminal at which counters see the sample clock; None: they take it inside the card."""
     clock: Terminal = "onboard"
@@ -144,10 +145,10 @@ class NidaqConfig(GalvoConfig):
 
 
 class NidaqDac:
-    """An NI card as a `Dac`. It has tasks only while something is written; `release` ends those of a run."""
+    """An NI card as a `Dac`. It has tasks only while something is set, written or measured; `release` ends a run's."""
 
     def __init__(self, config: NidaqConfig, address: str, clock: Clock) -> None:
-        """Look the card up and check that it can do what the config asks for. Moves nothing."""
+        """Look the card up. Moves nothing. Raises `LimitExceeded` if the config asks for more than it can do."""
         self.config, self.clock = config, clock
         self.card = NiCard(address)
         self.name = self.card.name
@@ -214,7 +215,7 @@ class NidaqDac:
                 _ = self.card.properties.serial_num
 
     def level(self) -> float | None:
-        """The drive at the mirror's output, measured by the card; None if it cannot, or not now."""
+        """The drive at the mirror's output, as the card measures it; None if it cannot, or cannot at present."""
         if self._simulated:  # NI's simulated cards measure a sine wave
             return None
         try:
@@ -228,7 +229,7 @@ class NidaqDac:
 
     def halt(self) -> float:
         """End all tasks with the markers low. The mirror stays where it is if the card can measure where, else it jumps
-        to the centre. Returns its drive."""
+        to the centre. Returns the mirror's drive."""
         self.release()
         drive = self.level()
         if drive is None or abs(drive) < _CENTRED:
@@ -237,7 +238,7 @@ class NidaqDac:
         return drive
 
     def dark(self) -> None:
-        """Write all marker lines low, and let the counters idle, which is low: cleared ones keep their level."""
+        """Write all marker lines low, and make the counters idle, which is low. Cleared ones would keep their level."""
         if self.lines:
             with self.card.errors(), self.card.task() as task:
                 self.add_lines(task)
@@ -249,7 +250,7 @@ class NidaqDac:
                 task.start()
 
     def add_counter(self, task: Any, name: str, delay: int, low: int, high: int) -> None:
-        """Add a counter to a task: after so many edges of the mirror's clock, pulses of `high` edges, `low` between."""
+        """Add a counter to a task: `delay` edges of the mirror's clock, then pulses of `high` edges, `low` between."""
         task.co_channels.add_co_pulse_chan_ticks(
             f"{self.card.device}/{name}",
             self.card.terminal(self.config.counted_at or "ao/SampleClock"),
@@ -269,14 +270,15 @@ class NidaqDac:
         task.do_channels.add_do_chan(self.lines, line_grouping=self.card.const.LineGrouping.CHAN_FOR_ALL_LINES)
 
     def release(self) -> None:
-        """End the tasks of a run, if there is one: markers low first, then the mirror, which keeps its level."""
+        """End a run's tasks, if there are any, the mirror's last, and take the markers low. The mirror keeps its
+        level."""
         with self.card.errors(), ExitStack() as steps:
             steps.callback(self.card.clear)
             steps.callback(self.dark)
             self.card.clear(keep=1)
 
     def close(self) -> None:
-        """Markers low, the mirror at the centre, and the channel to the server closed."""
+        """Take the markers low, put the mirror at the centre, and close the channel to the server."""
         try:
             self.release()
             self._centre()
@@ -291,10 +293,10 @@ class NidaqDac:
 
 
 def pulse_train(high: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """The pulses that a counter has to make for a marker that is high at these points, bool (points,): first point,
-    width and period of a pulse in points, and their number. None: it is never high.
+    """The pulses that a counter has to make for a marker that is high at these points, bool (points,): begin of the
+    first one, width and period, in points, and their number. None: it is never high.
 
-    A counter can only make equal pulses at equal distances. Raises ValueError for others, with widths and distances.
+    A counter makes equal pulses at equal distances, 2 points or more high and low. Raises ValueError for others.
     """
     if not high.any():
         return None
@@ -337,7 +339,7 @@ class NidaqRun(DacRun):
         self._dac.release()
 
     def give_up(self) -> None:
-        """End the tasks; the error that ended the run is the one to report."""
+        """End the tasks. An error is only logged: the one that ended the run is the one to report."""
         try:
             self._dac.release()
         except DeviceError as error:
@@ -388,7 +390,7 @@ class NidaqRun(DacRun):
         return write
 
     def _wire(self) -> None:
-        """Set start trigger and exports of the mirror's task, and arm the counters before it."""
+        """Set start trigger and exports of the mirror's task, and put the counters' tasks before it."""
         card, config, signal = self._card, self._dac.config, self._card.const.Signal
         if config.start != "now":
             self._mirror.triggers.start_trigger.cfg_dig_edge_start_trig(card.terminal(config.start))
@@ -410,7 +412,7 @@ class NidaqRun(DacRun):
         return task
 
     def _send(self, room: int) -> None:
-        """Append so many samples: points as long as there are any, then copies of the last one."""
+        """Append `room` samples: points as long as there are any, then copies of the last one."""
         if room <= 0:
             return
         points = self.source.take(room)
@@ -479,9 +481,9 @@ class Nidaq(DacScanner):
         """Open an NI card by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
 
         port: as in `NidaqConfig`. full_scale_v: the voltage at drive 1. max_point_rate_hz, buffer_s: the most points
-        per second; the samples queued ahead. settings: channel, markers, clock, start and all others of `NidaqConfig`.
-        host_clock: for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the
-        card cannot be opened.
+        per second; the duration of the samples queued ahead. settings: channel, markers, clock, start and all others of
+        `NidaqConfig`. host_clock: for emulators. Raises `LimitExceeded` for a setting that is not possible, other
+        `DeviceError` if the card cannot be opened.
         """
         config = config_of(
             NidaqConfig,
@@ -496,7 +498,7 @@ class Nidaq(DacScanner):
         return cls(NidaqDac(config, port, host_clock or SystemClock()), config)
 
     def __init__(self, dac: NidaqDac, config: NidaqConfig) -> None:
-        """Take over `dac`, which is closed with the scanner: marker lines low, mirror to the centre."""
+        """Take over `dac`, which is closed with the scanner. Takes the markers low and the mirror to the centre."""
         super().__init__(dac, config)
         self._counters = config.counters
         try:

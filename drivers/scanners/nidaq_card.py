@@ -1,7 +1,7 @@
 """NI-DAQmx for the scanner `nidaq`: a card of this computer, or one behind NI's gRPC device server.
 
-The package nidaqmx gives both the same calls. It sets no deadline on those to a server, so every one gets one here. Its
-errors become ours, in one line with NI's code.
+The package nidaqmx takes the same calls for both. It sets no deadline for a call to a server, so each gets one here.
+Its errors become those of `drivers.errors`, in one line with NI's code.
 
 Sources: docs/reference/devices/nidaq.md.
 """
@@ -31,7 +31,7 @@ from drivers.transports.endpoints import one_line
 GRPC_PREFIX = "grpc="
 CALL_S = 2.0
 _LATE_S = 0.5
-"""Deadline for a call to a gRPC server, and for those after one that was late: closing takes some 15 calls."""
+"""Deadlines for a call to a gRPC server, and for one after a call that was late, as closing takes some 15 calls."""
 _CONNECT_S = 5.0
 """Deadline for reaching a gRPC server."""
 
@@ -54,9 +54,9 @@ _CAUSES: tuple[tuple[type[DeviceError], str, frozenset[int]], ...] = (
     ),
     (DeviceTimeout, "check that its clock runs", frozenset((-200474, -200292, -50400))),
 )
-"""Errors of ours, what to do, and NI's codes that mean them. All other codes are `CommandRefused`."""
+"""Our errors, each with what to do and NI's codes that mean it. All other codes mean `CommandRefused`."""
 _NO_TASK = -200088
-"""Code for a task that was cleared, by a call that was interrupted."""
+"""Code for a task that does not exist: a call that was interrupted has cleared it already."""
 _UNSUPPORTED = (-200197, -200452)
 """Codes for a property that a card does not have."""
 
@@ -67,9 +67,9 @@ class NiCard:
     """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread."""
 
     def __init__(self, address: str) -> None:
-        """Load nidaqmx, and connect to the server if the address, "Dev1" or "HOST:PORT/Dev1", names one.
+        """Load nidaqmx, and connect to the server if the address, "Dev1" or "[grpc=]HOST:PORT/Dev1", names one.
 
-        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer.
+        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer, and as `errors`.
         """
         server, _, self.device = address.removeprefix(GRPC_PREFIX).rpartition("/")
         self.name = f"nidaq {self.device}"
@@ -90,7 +90,7 @@ class NiCard:
 
     @contextmanager
     def patient(self, limit_s: float) -> Iterator[None]:
-        """Within this context a call to a server may take so long, and no longer."""
+        """Within this context a call to a server may take at most `limit_s`, or `CALL_S` if that is shorter."""
         self._limit_s = min(limit_s, CALL_S)
         try:
             yield
@@ -98,20 +98,20 @@ class NiCard:
             self._limit_s = CALL_S
 
     def disconnect(self) -> None:
-        """Close the channel to the server, if there is one. Leaves the card as it is."""
+        """Close the channel to the server, if there is one. Leaves the card as it is. May raise `DeviceTimeout`."""
         if self._channel is not None:
             _aside(self._channel.close, 1.0)
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """Turn nidaqmx's errors into ours."""
+        """Turn nidaqmx's errors within this context into those of `drivers.errors`."""
         try:
             yield
         except self._error as error:
             raise self._ours(error) from error
 
     def new_task(self) -> Any:
-        """A new `nidaqmx.Task`, until `clear`."""
+        """A new `nidaqmx.Task`, which lasts until `clear`."""
         self._tasks.append(self._ni.Task(grpc_options=self._options))
         return self._tasks[-1]
 
@@ -125,7 +125,8 @@ class NiCard:
             self._clear(task)
 
     def clear(self, keep: int = 0) -> None:
-        """Clear all tasks but for so many of the oldest, the latest first. An interrupt leaves the rest for later."""
+        """Clear all but the `keep` oldest tasks, latest first; then raise the last error. An interrupt leaves the
+        rest."""
         failed: Exception | None = None
         while len(self._tasks) > keep:
             try:
@@ -147,7 +148,7 @@ class NiCard:
                 self._tasks.remove(task)
 
     def terminal(self, name: str) -> str:
-        """The full name of a terminal; one without a device is the card's own."""
+        """The full name of a terminal. A name without a device means a terminal of this card."""
         return name if name.startswith("/") else f"/{self.device}/{name}"
 
     def property_of(self, ask: Callable[[], Value]) -> Value | None:
@@ -169,9 +170,9 @@ class NiCard:
         return self.tune(task, base_hz / min(divisor, math.floor(base_hz / Fraction(low_hz))))
 
     def tune(self, task: Any, rate_hz: Fraction, source: str = "", samples: int = 1000) -> Fraction:
-        """Let a task run until it is stopped, with this sample clock. Returns the exact rate that the card reads back.
+        """Set up a task to run until it is stopped, with this sample clock. Returns the exact rate.
 
-        source: terminal of a clock that has this rate; "" is the card's own. samples: size of the buffer.
+        source: terminal of a clock at this rate; "" is the card's own, whose rate is read back. samples: of the buffer.
         """
         timing, continuous = task.timing, self.const.AcquisitionType.CONTINUOUS
         timing.cfg_samp_clk_timing(float(rate_hz), source=source, sample_mode=continuous, samps_per_chan=samples)
@@ -237,8 +238,8 @@ def _connect(server: str, limit_s: Callable[[], float]) -> Any:
 
 
 def _aside(work: Callable[[], Value], limit_s: float) -> Value:
-    """Do work in a thread of its own. Ctrl-C ends the wait for it, never the work: an interrupt inside gRPC can leave
-    its locks closed for good. Raises `DeviceTimeout` after the limit."""
+    """Do work in a thread of its own; returns or raises what it does. Ctrl-C ends the wait for it, never the work: an
+    interrupt inside gRPC can leave gRPC's locks closed for good. Raises `DeviceTimeout` after the limit."""
     answer: Future[Value] = Future()
 
     def act() -> None:

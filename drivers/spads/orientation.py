@@ -23,8 +23,8 @@ _SWAPS = tuple(
         (0xF0F0F0F00F0F0F0F, 0x00000000F0F0F0F0, 28),
     )
 )
-"""Three steps: bits that stay, bits that move up, and by how many places. A step swaps blocks of 1, 2 or 4 pixels
-across the diagonal."""
+"""For each of three steps: bits that stay, bits that move up, and by how many places. A step swaps blocks of 1, 2 or 4
+pixels across the diagonal."""
 
 
 def turned_size(width: int, height: int, turn_deg: QuarterTurn) -> tuple[int, int]:
@@ -33,7 +33,7 @@ def turned_size(width: int, height: int, turn_deg: QuarterTurn) -> tuple[int, in
 
 
 def turn_packed(bits: NDArray[np.uint8], turn_deg: QuarterTurn, out: NDArray[np.uint8]) -> None:
-    """Write `bits` (n, height, width / 8), turned counter-clockwise, to `out` (n, turned height, turned width / 8).
+    """Write `bits`, uint8 (n, height, width / 8), turned counter-clockwise, to `out`, (n, new height, new width / 8).
 
     Most significant bit = leftmost pixel. Width and height are multiples of 8. `out` must not overlap `bits`.
     """

@@ -3,15 +3,15 @@
 Facts and their sources: docs/reference/devices/spad512s.md. `spad512s_line` talks to the program. In short:
 
 - The vendor's program must run, on this computer or behind a bridge; it serves one client.
-- `PU,0` goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of 1 bit. tInt is in
-  microseconds at 1 and 4 bits, in milliseconds from 6 bits on.
+- `PU,0` (no pile-up correction) goes before every acquisition. `I,1,tInt,n,trigger,overlap,sparse,1` takes n frames of
+  1 bit. tInt, the exposure, is in microseconds at 1 and 4 bits, in milliseconds from 6 bits on.
 - The newest sample of the vendor adds the image width, older ones do not (`width_in_command`).
 - The answer is 32 768 bytes a frame (131 072 for a 1M sensor), most significant bit first; then `DONE`. Text that ends
   with `ERROR` may come at any point. Pixels may look like such text, so only the exact length and
   the bytes after it show the end.
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 - Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
-  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one is an
+  either. Pixels handed over twice would have the right length, so a frame identical to an earlier one of the run is an
   error, unless all its pixels are equal.
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
@@ -51,10 +51,10 @@ _UNIFORM = (0x00, 0xFF)
 
 
 class Spad512sRun:
-    """Receives a run block by block. The memory it returns is valid until the next block is asked for."""
+    """Receives a run block by block. The memory that `receive` returns is valid until `go_on`."""
 
     def __init__(self, name: str, line: Spad512sLine, n_frames: int, block_frames: int, frame_bytes: int) -> None:
-        """Allocate the memory; the command that starts the run is the caller's."""
+        """Allocate the memory. The caller sends the command that starts the run."""
         self.n_frames = n_frames
         self.next_frame = 0
         """First frame of the block that comes next."""
@@ -70,7 +70,7 @@ class Spad512sRun:
         """Bytes received so far of the present block and of the guard bytes behind it."""
         self._heard_at = time.monotonic()
         self._seen: dict[tuple[int, int], int] = {}
-        """Numbers of the frames seen, by the checksums of their halves. 32 bits would be too few for 10 000 frames."""
+        """Numbers of the frames seen, by checksums of their halves; 32 bits alone are too few for 10 000 frames."""
 
     @property
     def next_n(self) -> int:
@@ -83,7 +83,8 @@ class Spad512sRun:
         return self.next_frame + self.next_n == self.n_frames
 
     def receive(self, ends_at: float, timeout_s: float, stopped: Callable[[], bool]) -> NDArray[np.uint8] | None:
-        """Pixels of the next block, uint8 (n * frame bytes,), once their length is confirmed; None if stopped.
+        """Pixels of the next block, uint8 (n * frame bytes,), once `DONE` or `GUARD_BYTES` have followed; None if
+        stopped.
 
         A call continues where the last one ended. Raises `DeviceTimeout` at `ends_at` (of `time.monotonic`),
         `DeviceFault` with the device's own words, or `ProtocolError`.
@@ -101,7 +102,7 @@ class Spad512sRun:
         return pixels
 
     def go_on(self) -> None:
-        """Drop the block, once it has been used. The bytes that were read beyond its end begin the next one."""
+        """Drop the block that `receive` returned. The bytes that were read beyond its end begin the next one."""
         used = self.next_n * self._frame_bytes
         self._memory[: self._got - used] = self._memory[used : self._got]
         self._got -= used
@@ -133,7 +134,7 @@ class Spad512sRun:
             )
 
     def _require_done(self, pixel_bytes: int) -> None:
-        """Check that DONE stands exactly behind the last pixel, and nothing behind it."""
+        """Raise DeviceFault or ProtocolError unless DONE stands directly behind the last pixel."""
         behind = self._memory[pixel_bytes : self._got].tobytes()
         if behind == DONE:
             return
@@ -301,8 +302,7 @@ class Spad512s(SpadArray):
 
     def _check_period(self, request: SpadRequest, exposure_us: int) -> None:
         """Raise `LimitExceeded` for a frame rate that the device does not run at by itself. Running free, its period is
-        the longer of exposure and read-out.
-        """
+        the longer of exposure and read-out. With an external trigger nothing is checked."""
         if self._config.trigger == "external":
             return
         period_s = max(Fraction(exposure_us, 1_000_000), 1 / self._info.max_frame_rate_hz)
@@ -367,7 +367,7 @@ class Spad512s(SpadArray):
             return run.next_n > 0
 
     def _fill(self, run: Spad512sRun, ring: BlockRing, timeout_s: float) -> None:
-        """Receive one block and publish it."""
+        """Receive one block, unless stopped, and publish it, or drop it if the ring is full and does not wait."""
         ends_at = time.monotonic() + timeout_s
         pixels = run.receive(ends_at, timeout_s, self._halt.is_set)
         if pixels is None:
@@ -394,7 +394,8 @@ class Spad512s(SpadArray):
         return seal_block(memory, self._header(run), layout, payload_crc=False)
 
     def _claim(self, ring: BlockRing, ends_at: float, timeout_s: float) -> NDArray[np.uint8] | None:
-        """A free slot; None if there is none and the ring does not wait. Raises `DeviceTimeout` if none comes free."""
+        """A free slot; None if the ring has none and does not wait. Raises `DeviceTimeout` after `timeout_s` or a
+        stop."""
         while True:
             memory = ring.claim(min(SLICE_S, max(0.0, ends_at - time.monotonic())))
             if memory is not None or not ring.waits:

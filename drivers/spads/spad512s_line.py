@@ -5,7 +5,7 @@ Sources there: `nirrafa/SPAD512S-remote-gui` theoretical_info/piimaging_examples
 SPAD512/instruments/SPAD512S.py. The protocol has neither framing nor request numbers, and serves one client. Commands
 go one at a time, and the length of an answer is not announced. On connection the program sends a banner whose first
 word is the detector type. The first `D` may report that a calibration of the breakdown voltage starts. Then nothing may
-be sent before "The breakdown is around", and `D` is sent again.
+be sent before the text "The breakdown is around" has come; after it `D` is sent again.
 """
 
 import logging
@@ -90,8 +90,8 @@ class Spad512sLine:
         return self._stream is not None
 
     def connect(self) -> Spad512sIdentity:
-        """Connect: read the banner, send `D`, wait for a calibration if one runs, then send `D` again. Raises what
-        `TcpStream` raises, `DeviceBusy`, `DeviceTimeout`, `ProtocolError` or `DeviceFault`."""
+        """Connect, read the banner and send `D`; if a calibration runs, wait for its end and send `D` again. Raises
+        what `TcpStream` raises, `DeviceBusy`, `DeviceTimeout`, `ProtocolError` or `DeviceFault`."""
         self._stream = TcpStream(self._name, self.address)
         try:
             return self._greet(self._stream)
@@ -111,7 +111,7 @@ class Spad512sLine:
             self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
-        """Send a command and return its answer. Raises DeviceFault if that is an ERROR, DeviceTimeout if none comes."""
+        """Send a command and return its answer. Raises DeviceFault for an ERROR, DeviceTimeout if none comes."""
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()
@@ -127,7 +127,7 @@ class Spad512sLine:
 
     @contextmanager
     def _given_up_on_silence(self) -> Iterator[None]:
-        """Close a connection that is gone or silent: a late answer would pass for the answer to the next command."""
+        """Close a connection found gone or silent within this context: a late answer would pass for the next one."""
         try:
             yield
         except (DeviceTimeout, DeviceDisconnected):
@@ -232,7 +232,7 @@ class Spad512sLine:
             self._tap.note("tcp", direction, data)
 
     def _read_text(self, stream: TcpStream, deadline_s: float) -> str:
-        """The text until a silence or DONE, at most for `deadline_s`; empty if nothing came."""
+        """The text until a silence or DONE, at most for `deadline_s`, stripped; empty if nothing came."""
         ends_at = time.monotonic() + deadline_s
         data = stream.receive(deadline_s)
         while data and not data.endswith(DONE) and time.monotonic() < ends_at:

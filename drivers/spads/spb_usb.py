@@ -1,8 +1,8 @@
 """A SPAD array on USB that speaks SPB1 (docs/reference/spb1-usb.md), behind a Cypress FX3 or an FT601.
 
-The protocol is this project's own proposal. Opening checks product string, identity registers and a test pattern. The
-device counts and time-stamps frames itself, follows its window table by the line markers, and takes its gate low if no
-PING comes for `heartbeat`. Pings are sent by `fill`, between two blocks, so the light ends if the source thread hangs.
+The protocol is this project's own proposal. Opening checks product string, identity registers and, if there is one, a
+test pattern. The device counts and time-stamps frames itself, moves its windows by the markers, and takes its gate low
+if no PING comes for `heartbeat`. `fill` sends pings, between two blocks, so the light ends if the source thread hangs.
 """
 
 import logging
@@ -244,8 +244,8 @@ class SpbUsb(SpadArray):
         )
 
     def _finish(self, receiver: BlockReceiver) -> None:
-        """End the run and ask the device how much it exposed, since its last blocks may be lost. Raises
-        `DeviceFault` if it does not say, or its watchdog ended the run."""
+        """End the run and ask the device how much it exposed, since its last blocks may be lost. Raises `DeviceFault`
+        if neither its answer nor its last block says so, or if its watchdog ended the run."""
         self._receiver = None
         receiver.close()
         try:
@@ -270,7 +270,7 @@ class SpbUsb(SpadArray):
                 self._end_run(receiver)
 
     def _end_run(self, receiver: BlockReceiver) -> None:
-        """Abort, wait for the last block so that none is left for the next run, and cancel the queued reads."""
+        """Abort, read up to the last block, so that none is left for the next run, and cancel reads. Logs errors."""
         self._receiver = None
         exposed: int | None = None
         try:

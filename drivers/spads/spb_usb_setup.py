@@ -138,15 +138,14 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """Make the run end after `n_frames` frames; None: at STOP."""
+    """Make the run end after `n_frames` frames; None: only when it is told to end."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
 
 def block_size(identity: SensorIdentity, width: int, block_frames: int, name: str) -> tuple[int, int]:
-    """Stride and number of frames of a block: as many as requested, or as many as fit. Raises `LimitExceeded` if none
-    fits.
-    """
+    """Stride of a block in bytes, and its number of frames: as many as requested, or as many as fit. Raises
+    `LimitExceeded` if none fits."""
     height = identity.info.height
     try:
         n = min(block_frames, frames_per_block(identity.max_stride, width, height))
@@ -168,7 +167,7 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped if it has no pattern."""
+    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped without a pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks
@@ -204,7 +203,7 @@ Chip = Literal["fx3", "ft601"]
 LABEL = "SPB1 SPAD"
 _SESSION_OUT = 0x01
 _COMMAND = struct.Struct("<IBBHIII")
-"""index, pipe, command, 0, length, 0, 0 (docs/reference/devices/spb1-usb-chips.md)."""
+"""Fields of a session command: index, pipe, command, 0, length, 0, 0 (docs/reference/devices/spb1-usb-chips.md)."""
 _ABORT, _STREAM, _CLEAR = 0, 2, 3
 _STREAM_BYTES = 1 << 20
 _CONFIG_REQUEST, _CONFIG_BYTES = 0xCF, 152
@@ -225,7 +224,7 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """Clear what an unclosed session left behind, then tell the FT601 to stream. May raise `ProtocolError`."""
+        """For an FT601: clear what an unclosed session left behind, then let it stream. May raise `ProtocolError`."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
@@ -235,7 +234,7 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """End the session. An FT601 whose session is not ended answers nobody until it is plugged in again."""
+        """End an FT601's session. A chip whose session is not ended answers nobody until it is plugged in again."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)

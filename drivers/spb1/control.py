@@ -42,9 +42,9 @@ class Op(IntEnum):
     START = 3
     """Start a run. The acknowledgement holds its run_id."""
     STOP = 4
-    """End after the frame under way; what is in the FIFO is still sent."""
+    """End the run after the frame under way; frames in the device's memory are still sent."""
     ABORT = 5
-    """Lower the gate, empty the memory, then send one block without frames, flagged last and aborted."""
+    """Lower the gate, empty the memory, then send one block without frames, flagged last, with status aborted."""
     PING = 6
     """Show that the host is alive. The value is the last frame number received (low 32 bits)."""
 
@@ -229,7 +229,7 @@ class ControlChannel:
         return self.read_all((register,))[0]
 
     def read_all(self, registers: Sequence[int]) -> list[int]:
-        """The values of several registers. All are read twice, since they have no checksum. Raises `ProtocolError` if
+        """The values of several registers. All are read twice, because they have no checksum. Raises `ProtocolError` if
         the two readings differ in each of three attempts."""
         for _ in range(_TRIES):
             values = [ack.value for ack in self._ask([(Op.READ, register, 0) for register in (*registers, *registers)])]
@@ -292,7 +292,7 @@ class ControlChannel:
             self._tap.note(TAP_PORT, direction, data)
 
     def _ask(self, requests: Sequence[tuple[int, int, int]]) -> list[Ack]:
-        """Send commands, some at a time, and return their acknowledgements in order."""
+        """Send commands, several in each transfer, and return their acknowledgements in order."""
         acks = []
         for at in range(0, len(requests), _AT_ONCE):
             commands = [self._command(*request) for request in requests[at : at + _AT_ONCE]]

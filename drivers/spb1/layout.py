@@ -116,7 +116,7 @@ def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray
 def views_at(
     buffer: NDArray[np.uint8], layout: BlockLayout, records_offset: int, pixels_offset: int
 ) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
-    """Records and bits of `layout` as views at given offsets, which differ from ours if a block's header is longer."""
+    """Records and bits of `layout` as views at given offsets, which are not the usual ones if a header is longer."""
     n = layout.n_frames
     records: NDArray[np.void] = buffer[records_offset : records_offset + n * FRAME_RECORD.itemsize].view(FRAME_RECORD)
     pixels = buffer[pixels_offset : pixels_offset + n * layout.frame_bytes]
@@ -144,8 +144,7 @@ def seal_block(
 ) -> FrameBlock:
     """Write everything except records and pixels, which the source filled in through `block_views`; returns the block.
 
-    The block is a view of `buffer`, uint8 (stride,), contiguous; nothing is copied. The bytes after the trailer are
-    zeroed.
+    The block is a view of `buffer`, uint8 (stride,), contiguous; nothing is copied. Bytes after the trailer are zeroed.
     payload_crc: whether to compute the payload's CRC, which reads every byte; else the trailer says 'not computed'.
     Raises ValueError if the buffer is too short, or the header contradicts the layout or has no packed SPB1 1.0 form.
     """

@@ -89,8 +89,8 @@ def parse_block(buffer: NDArray[np.uint8], *, check_payload: bool) -> FrameBlock
 
     Raises `UnsupportedBlock` if its header is sound but states another major version, another payload than packed
     frames, other than 1 bit per pixel, or every k-th frame only. Raises `CorruptBlock` if anything else is wrong with
-    the block; the payload is checked only if `check_payload`.
-    A truncated block gives its complete frames. Blocks with the least significant bit first are copied and delivered
+    the block; the payload is checked only if `check_payload`, and if the block states its CRC.
+    A truncated block gives its complete frames. A block with the least significant bit first is copied and delivered
     like all others, without that flag.
     """
     return read_frames(buffer, read_header(buffer), check_payload=check_payload)
@@ -139,10 +139,10 @@ def read_control(buffer: NDArray[np.uint8], fields: HeaderFields) -> bytes:
     if fields.block_bytes > len(buffer):
         raise CorruptBlock(f"control block cut off: {len(buffer)} of {fields.block_bytes} bytes")
     _, valid_bytes, payload_crc = _read_trailer(buffer, fields)
-    payload = bytes(buffer.data[fields.header_bytes : fields.header_bytes + valid_bytes])
+    payload = buffer.data[fields.header_bytes : fields.trailer_offset]
     if payload_crc:
         _check_crc("control block", crc32(payload), payload_crc)
-    return payload
+    return bytes(payload[:valid_bytes])
 
 
 @lru_cache(maxsize=16)
@@ -240,7 +240,7 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
 
     stride: bytes from block to block. None if it is unknown or changes: then each block ends at its own size, and zeros
     up to the next one are padding. After damage, reading resumes at the next header with the right CRC on a multiple of
-    `ALIGN`. A block whose number does not rise within its run was sent or written twice and counts as damage. Control
+    `ALIGN`. A block whose number does not rise within its run counts as damage: it was sent or written twice. Control
     blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not support.
     """
     last: FrameBlock | None = None

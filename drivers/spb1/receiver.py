@@ -23,8 +23,8 @@ from drivers.transports.bulk_link import Buffer, BulkLink
 _log = logging.getLogger(__name__)
 
 QUEUE_BYTES = 8 << 20
-"""Total size of the reads in flight: 20 ms of the fastest link, by which a busy host may be late. It is half of what
-Linux grants by default."""
+"""Total size of the reads in flight: what the fastest link brings in 20 ms, by which a busy host may be late. It is
+half of what Linux grants by default."""
 MOST_READS, FEWEST_READS = 64, 4
 _WORD_PX = 64
 _LAST, _LOST_BEFORE, _FORCED_LOW = (

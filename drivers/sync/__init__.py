@@ -1,1 +1,1 @@
-"""Pulse generators that play gate and markers: the PrawnDO."""
+"""Pulse generators that play SPAD trigger, gate and markers: PrawnDO, Teensy and Pulse Streamer."""

@@ -1,4 +1,4 @@
-"""The base of boards that play patterns: outputs on pins of the user's choice, and a start that fails dark."""
+"""The base of boards that play patterns: pins of the user's choice, and outputs that go low if a start fails."""
 
 import logging
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ class OutputPins:
     marker: int = 2
 
     def levels(self, outputs: int) -> int:
-        """Levels of the pins for an OR of `OUT_*`."""
+        """Levels of the pins, bit by pin, for an OR of `OUT_*`."""
         return sum(1 << pin for output, pin in self._pairs if outputs & output)
 
     def outputs(self, levels: int) -> int:
-        """The OR of those `OUT_*` whose pins are high."""
+        """The OR of those `OUT_*` whose pins are high in `levels`, bit by pin."""
         return sum(output for output, pin in self._pairs if levels >> pin & 1)
 
     @property
@@ -58,7 +58,7 @@ class BoardConfig(KindConfig):
 
 
 class SyncBoard(SyncSource):
-    """A sync source that is a board at a port: it may have started although its answer did not arrive."""
+    """A sync source that is a board at a port: it may play a program although its answer to `run` did not arrive."""
 
     _lowered = 0
     """Number of calls of `gate_low` and `abort`."""
@@ -74,15 +74,15 @@ class SyncBoard(SyncSource):
         super().abort()
 
     def run(self) -> None:
-        """Play the program from its first word. If that fails in any way, or another thread has called `gate_low` or
-        `abort` meanwhile, all outputs are low when the error leaves."""
+        """Play the program from its first word. If that fails once begun, or another thread calls `gate_low` or `abort`
+        meanwhile, takes all outputs low before it raises; a failure of that is only logged."""
         lowered = self._lowered
         try:
             super().run()
             if self._lowered != lowered:
                 raise DeviceFault(f"{self.name}: run was ended by gate_low or abort; run again")
         except WrongState:
-            raise  # nothing was sent
+            raise  # nothing was sent, or `_do_run` has taken the outputs low
         except BaseException:
             try:
                 self._do_abort()

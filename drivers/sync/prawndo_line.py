@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 IDLE = (0, 5)
-"""Values of `run-status`: stopped and aborted. In others only `sts`, `abt`, `ver` and `brd` are executed."""
+"""Values of `run-status`: stopped and aborted. In others only `sts`, `abt`, `ver`, `brd`, `deb`, `ndb` are executed."""
 BYTES_PER_WORD = 6
 
 _CRLF = b"\r\n"
@@ -32,10 +32,10 @@ USB_IDS = (0x2E8A, 0x000A)
 """Vendor and product of the firmware on either board: those of any Pico, so other firmware may show them too."""
 _WAKE = b"\n0 0\nend\nndb\n"
 """Ends what an earlier host may have begun by hand: `edt` swallows all lines up to two numbers, `add` up to `end`, and
-neither hears `abt`. Then no debug output, which would stand among the answers and delays `abt`."""
+neither hears `abt`. Then switches debug output off, which would stand among the answers and delays `abt`."""
 _RESUSCITATED = "System Clock Resus'd"
 _READY = "ready"
-"""Answer to `adm`, behind which the board hears no commands. It may be left over from a host that died then."""
+"""Answer to `adm`, after which the board takes only the program's bytes. A host that died then may have left it."""
 _CHUNK_BYTES = 4032
 """Bytes per write while a program is loaded: sixteen of the firmware's own pieces of 42 words."""
 _SLICE_S = 0.02

@@ -8,11 +8,11 @@ port, waits 10 s for an answer, prints, and obeys the environment's web proxies.
 and ignores edges meanwhile. So a program may wait for the scan marker where it begins, and again only where it repeats:
 what follows each wait must be the same. Other programs, such as blanking patterns, are refused.
 
-**Repeats.** After a sequence the box arms itself again, for ever. A program of one sweep is played without that, so the
-box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes the outputs low
-after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or network are
-late; then the gate goes on opening at each scan marker until the count is full, the markers cease or `abort` is called.
-If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
+**Repeats.** After a sequence the box arms itself again, for ever. A program of one sweep, or without waits, is played
+without that, so the box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes
+the outputs low after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or
+network are late; then the gate goes on opening at each scan marker until the count is full, the markers cease or
+`abort` is called. If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
 
 **Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so a mirror that stops
 would be lit until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless the
@@ -63,11 +63,11 @@ _log = logging.getLogger(__name__)
 OLDEST_FIRMWARE = (1, 2, 0)
 """Oldest firmware that is accepted: its client has all methods that are used here."""
 LOW: Final = (0, 0, 0, 0)
-"""State with all outputs low: no duration, channels, two analog outputs."""
+"""State with all outputs low, as `constant` takes it: duration (none), channels, two analog outputs."""
 SOFTWARE, RISING = 1, 2
 """Starts of a sequence (`setTrigger`): by `startNow`, or at a rising edge of the trigger input."""
 AUTO, MANUAL = 0, 1
-"""Whether the trigger is armed again after a sequence, or not."""
+"""Rearming (`setTrigger`): AUTO arms the trigger again after each sequence, MANUAL does not."""
 CHECK_S = 0.2
 """Time after which a box that waits for the scan marker is asked whether it still does: a restart loses its program."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
@@ -79,8 +79,8 @@ _PROBE_S, _PROBE_PAUSE_S = 1.0, 0.01
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A program that was started. count: None if the box itself ends it. aborts: how often outputs were taken low
-    before."""
+    """A program that was started. waits: as in `GateSequence`. count: None if the box itself ends it. aborts: how often
+    outputs were taken low before. over: set once it has ended or been aborted."""
 
     waits: bool
     count: SweepCount | None
@@ -112,8 +112,8 @@ class PulseStreamer(SyncBoard):
     """A Pulse Streamer 8/2. Opening it first takes all outputs low, whatever the box was doing, and resets it.
 
     The box obeys everybody on its network: keep other programs away from it. A program of several sweeps is ended by
-    this computer. If that is forgotten, it is done when the object is deleted or Python ends; if the process is killed,
-    the box opens the gate at every scan marker until it is opened again.
+    this computer. If nobody closes the device, that is done when the object is deleted or Python ends; if the process
+    is killed, the box opens the gate at every scan marker until a program opens the box again.
     """
 
     def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings, call_s: float = CALL_S) -> None:
@@ -172,13 +172,13 @@ class PulseStreamer(SyncBoard):
 
     @property
     def resolution_s(self) -> float:
-        """1 ns. The box makes a sequence a multiple of 8 ns long, with its last levels, and samples its trigger every 8
+        """1 ns. The box lengthens a sequence to a multiple of 8 ns, by its last levels, and samples its trigger every 8
         ns: a sweep begins 61 to 69 ns after the scan marker."""
         return RESOLUTION_S
 
     @property
     def port_lost(self) -> bool:
-        """Whether the box has not answered while a program ran. May be called from any thread."""
+        """Whether the box gave no answer, or a wrong one, while a program ran. May be called from any thread."""
         return self._lost
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -250,7 +250,7 @@ class PulseStreamer(SyncBoard):
 
     def _lower(self, ended: Literal["stopped", "aborted"] = "aborted") -> None:
         """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives up.
-        ended: state of the program, if there is one."""
+        ended: state that `status` then reports for a program that was started."""
         self._aborts += 1
         try:
             self._rpc.call("constant", LOW)
@@ -266,7 +266,7 @@ class PulseStreamer(SyncBoard):
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
-        """Whether a program has ended, judged by an answer of the box; if so, take the outputs low."""
+        """Whether a program has ended, by the box's answer; if so, take the outputs low. May raise `DeviceError`."""
         if run.count is not None:
             ended = run.count.take(asked_s, now_s(self._clock), plays)
         else:
@@ -280,7 +280,7 @@ class PulseStreamer(SyncBoard):
         return ended or run.over.is_set()
 
     def _watch(self, run: _Run) -> None:
-        """Count the sweeps of a program and see to it that the box answers, until the program is over."""
+        """Count the sweeps of a program until it is over. On an error set `port_lost` and try to take outputs low."""
         checked_s = now_s(self._clock)
         while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(now_s(self._clock))):
             try:
@@ -363,8 +363,8 @@ def _replace_program(rpc: JsonRpc) -> None:
 
 
 def _forgotten(name: str, rpc: JsonRpc, armed: threading.Event, process: int) -> None:
-    """Take the outputs of a box low that goes on opening the gate although nobody closes it: Python ends, or its object
-    was deleted. process: that of the box; in one that was forked from it nothing is done."""
+    """Take the outputs low if a program may still run when Python ends or the device is deleted without `close`. Only
+    logs errors. process: number of the process that opened it; in another one, forked from it, nothing is done."""
     if os.getpid() != process or not armed.is_set():
         return
     try:

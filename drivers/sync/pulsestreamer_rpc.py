@@ -22,10 +22,10 @@ PORT = 8050
 CALL_S = 2.0
 """Deadline for a call, from the connection to the end of the answer."""
 LATE_CALLS = 5
-"""So many times the deadline after a call that was not answered no program is started: heard late, the call could stop
-the program in its midst, with the gate high."""
+"""After a call that was not answered, no program is started for so many times the deadline: heard late, the call could
+stop the program in its midst, with the gate high."""
 RETRY_S = 0.3
-"""Time for which a connection that is refused, or closed without a word, is tried again: the box may serve another."""
+"""Time for which a refused connection, or one closed without a word, is tried again: the box may serve others."""
 _REPEATABLE = ("constant", "get", "has", "is")
 """Beginnings of methods that may be called again if the box may have heard them already. A second `stream` could stop a
 sequence in its midst, with the gate high."""
@@ -40,7 +40,7 @@ class JsonRpc:
     def __init__(self, name: str, address: str, tap: Tap | None = None, call_s: float = CALL_S) -> None:
         """Look the host up, once. name: the device's name in messages; address: "host" or "host:port".
 
-        Raises `DeviceNotFound` for an address that is none or a host that is not known.
+        Raises `DeviceNotFound` for a malformed address or an unknown host.
         """
         self._name, self._address, self._tap, self._call_s = name, address, tap, call_s
         self._numbers, self._unanswered_s = itertools.count(1), -math.inf
@@ -85,7 +85,7 @@ class JsonRpc:
         return answer["result"]
 
     def _exchange(self, method: str, body: bytes) -> bytes:
-        """Send a question; returns what was answered, as far as it came."""
+        """Send a question; returns the answer as far as it came, or the error's text if it is no HTTP."""
         head = (
             f"POST /json-rpc HTTP/1.1\r\nHost: {self._peer[0]}:{self._peer[1]}\r\nConnection: close\r\n"
             f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
@@ -126,7 +126,7 @@ class JsonRpc:
 
 
 class _Link(socket.socket):
-    """A connection whose every wait ends at one time of `time.monotonic`, for all of them together."""
+    """A connection on which all waits together end at `ends_at`, a time of `time.monotonic`."""
 
     def __init__(self, ends_at: float) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_STREAM)

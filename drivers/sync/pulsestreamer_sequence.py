@@ -24,7 +24,7 @@ MIN_TICKS = 3
 MAX_TICKS = 2**32 - 1
 """Longest step in ns. Longer words become several steps."""
 MAX_STEPS = 100_000
-"""Most steps of a sequence. The box holds 2 000 000; so many are uploaded within the deadline of a call."""
+"""Most steps of a sequence. The box holds 2 000 000; only this many surely arrive within the deadline of a call."""
 STEP = np.dtype([("ticks", ">u4"), ("levels", "u1"), ("analog", ">i2", 2)])
 """Nine bytes, as `stream` takes them in base64."""
 POLL_S = 0.001
@@ -60,7 +60,7 @@ class GateSequence:
 def compile_sequence(
     name: str, pulses: Sequence[Pulse], repeats: int, pins: OutputPins, *, external_hold: bool
 ) -> GateSequence:
-    """The sequence for a program. external_hold: hardware holds the gate by the scan marker.
+    """The sequence for a program. external_hold: whether hardware ANDs the gate with the scan marker.
 
     Raises `LimitExceeded` for waits that the box cannot play, held pulses that nothing holds, and words that are too
     short or too many.
@@ -85,7 +85,7 @@ def compile_sequence(
 
 
 def _steps(name: str, pulses: Sequence[Pulse], first: int, end: int, pins: OutputPins) -> NDArray[np.void]:
-    """Steps of the words from `first` to before `end`."""
+    """Steps of the words from `first` up to, but not including, `end`: `STEP` (n,)."""
     steps: list[tuple[int, int, tuple[int, int]]] = []
     for index in range(first, end):
         duration_s, levels = pulses[index].duration_s or 0.0, pins.levels(pulses[index].outputs)
@@ -119,8 +119,8 @@ def _require_short_holds(name: str, pulses: Sequence[Pulse]) -> None:
 class SweepCount:
     """Counts the sweeps that a box has played, from its answers to the question whether it plays. Thread-safe.
 
-    Times are those of `time.monotonic`. An answer is true for some time between question and answer. A box that plays
-    has begun a new sweep if it did not play before, or if the last sweep must be over. So none is counted twice.
+    Times are seconds of the device's clock. An answer is true of some moment between question and answer. A box that
+    plays has begun a new sweep if it did not play before, or if the last sweep must be over. So none is counted twice.
     """
 
     sweeps: int

@@ -5,8 +5,8 @@ its outputs low when the port closes, so usually when the process that holds it 
 that, its watchdog does the same: a computer that freezes, or a port that another process still holds open.
 
 The driver's own thread feeds the watchdog, since nobody else asks a sync source regularly, neither a notebook nor the
-guard. The guard watches the application, and the application the guard, so this thread need not: it ends with its
-process, or if the device is deleted. Each line that is sent may delay one edge by up to 4 us, so it sends few.
+guard. The guard watches the application, and the application the guard, so this thread need not watch either: it ends
+with its process, or if the device is deleted. Each line that is sent may delay one edge by up to 4 us, so it sends few.
 """
 
 import logging
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 VERSION = "1"
 WATCHDOG_S = 2.0
-"""Longer than a loaded host delays a thread, and than the guard excuses an application at work."""
+"""Longer than a loaded host delays a thread, and longer than the guard excuses an application at work."""
 MOST = 2**32 - 1
 """Largest number of repeats, and of ticks."""
 _BEATS = 4
@@ -157,7 +157,7 @@ class Teensy(SyncBoard):
         return self._line.port.lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """4294967295 times whatever fits the memory once."""
+        """4294967295 if `pulses` fit the memory once, else 0."""
         return MOST if len(pulses) <= self._board.words else 0
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -190,7 +190,7 @@ class Teensy(SyncBoard):
         self._line.close()
 
     def _beat(self, over: threading.Event) -> None:
-        """Send the board a line; sets `over` if the program is over or the port lost."""
+        """Send the board a line; sets `over` if the program is over or the port lost. Raises no `DeviceError`."""
         try:
             answer = self._line.ask("status", STATUS, TRIES)
         except DeviceError as error:
@@ -206,7 +206,7 @@ class Teensy(SyncBoard):
 
 
 def _feed_watchdog(device: "weakref.ref[Teensy]", over: threading.Event, period_s: float) -> None:
-    """Feed the watchdog until the program is over, or the device closed or deleted, which closes its port."""
+    """Feed the watchdog until the program is over, or the device is closed or deleted (either closes its port)."""
     while not over.wait(period_s):
         board = device()
         if board is None:

@@ -22,9 +22,9 @@ USB_IDS = (0x16C0, 0x0483)
 REPLY_S = 1.0
 """Deadline for a reply. One over USB takes 1 ms; the rest is a margin for a busy host."""
 OPENING = 3
-"""The first reply may take so many times as long: a host that starts a scan is busy."""
+"""The first reply may take this many times as long: a host that starts a scan is busy."""
 TRIES = 3
-"""Number of times that a command is sent which may come twice."""
+"""Most times that a command is sent, if it may come twice."""
 DONE = re.compile(r"ok( \d+)?")
 IDENTITY = re.compile(r"ok spadrig-sync (\d{1,9}) (\d{1,8}) words=(\d{1,9}) tick_ns=(\d{1,9}) shortest=(\d{1,9})")
 STATUS = re.compile(

@@ -1,2 +1,1 @@
-"""Byte transports between a driver and its device: serial ports and USB, with deadlines and this project's
-errors."""
+"""Byte transports between a driver and its device: serial ports, USB and TCP. Calls that wait have deadlines."""

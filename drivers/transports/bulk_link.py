@@ -44,7 +44,7 @@ _ERRNO = {
 
 
 class PlainLink(UsbDevice):
-    """A streaming USB device read through pyusb, one piece after the other, with a gap between them."""
+    """A streaming USB device read through pyusb: one read after the other, with gaps between them."""
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
         """Open the device of a listing and claim its interfaces."""
@@ -59,8 +59,8 @@ class PlainLink(UsbDevice):
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """Read into the oldest queued buffer now; returns it and its number of bytes. None if nothing
-        is queued, or if the buffer is not complete in time; the next call then continues with it."""
+        """Read into the oldest queued buffer now; returns it and the number of bytes read. None if nothing is queued,
+        or if it is neither filled nor ended by a short packet in time; the next call then continues with it."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -73,7 +73,7 @@ class PlainLink(UsbDevice):
             return None
         buffer[self._got : self._got + n] = np.frombuffer(self._scratch, np.uint8)[:n]
         self._got += n
-        # A time-out that brought whole packets only is no end of the transfer: a short packet would be one.
+        # A time-out that brought only whole packets does not end the transfer; a short packet would.
         if self._got < len(buffer) and n > 0 and n % 512 == 0:
             return None
         self._queue.popleft()
@@ -154,7 +154,7 @@ class QueuedLink:
             return bytes(self._handle.controlRead(request_type, request, value, index, length, milliseconds(timeout_s)))
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Queue a read of the whole buffer. False if the kernel takes no more and at least one is in flight."""
+        """Queue a read of the whole buffer. False if the kernel takes no more while at least one read is in flight."""
         read = _Read(self._transfer(), buffer)
         with self._translated(endpoint):
             try:
@@ -169,8 +169,8 @@ class QueuedLink:
         return True
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
-        """The buffer of the oldest queued read and its number of bytes, once it is complete; None if the time is over
-        first or nothing is queued.
+        """The buffer of the oldest queued read and the number of bytes read; None if the read does not end in time, or
+        nothing is queued. Raises `DeviceError` if the read failed.
         """
         if not self._queue or not self._wait(self._queue[0], timeout_s):
             return None
@@ -229,7 +229,7 @@ class QueuedLink:
         raise DeviceNotFound(f"{self.label}: gone since it was found; plug it in again")
 
     def _hint(self, size: int) -> None:
-        """Tell once how the kernel can be made to take more transfers."""
+        """Log, the first time only, how the kernel can be made to take more transfers."""
         if not self._hinted:
             self._hinted = True
             _log.warning(
@@ -253,7 +253,7 @@ class QueuedLink:
 
     @contextmanager
     def _translated(self, endpoint: int | None = None, timeout_s: float = 0.0) -> Iterator[None]:
-        """Turn libusb1's exceptions into ours."""
+        """Turn libusb1's exceptions into those of `drivers.errors`."""
         try:
             yield
         except self._usb1.USBError as error:

@@ -3,8 +3,8 @@ reply.
 
 Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, Lasers on a serial line), so a late one
 would be taken for the answer to the next command. Therefore the input is dropped before each command, and each reply
-must have the form that its command calls for. If a reply has another form, or none comes, the line is drained and a
-query is sent whose answer is known. The form of a make's commands and replies is its `Framing`.
+must have the form that its command calls for. If a reply has another form, or none comes, the line is drained, a query
+is sent whose answer is known, and then the command again. The form of a make's commands and replies is its `Framing`.
 
 Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
 released it; with a plain lock the thread that wants to switch the laser off could wait for ever.
@@ -22,7 +22,7 @@ from drivers.transports.serial_port import SerialPort
 
 
 class FairLock:
-    """A lock for `with`, not re-entrant. A waiting thread gets it before the thread that had it last."""
+    """A lock for `with`, not re-entrant. A waiting thread gets the lock before the thread that had it last."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -79,7 +79,7 @@ class Framing(Protocol):
         """
 
     def refusal(self, reply: str) -> str | None:
-        """The reason for which `reply` refuses its command; None if it does not."""
+        """The reason for which `reply` refuses its command; None if it is no refusal."""
 
 
 class Dialogue:
@@ -151,8 +151,8 @@ class Dialogue:
         raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
 
     def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
-        """Set a value and read it back; only what reads back counts. If it is not `wanted`, raises `CommandRefused` if
-        the device refused the command, else `DeviceFault`.
+        """Set a value and read it back, up to three times; only what reads back counts. If it is not `wanted`, raises
+        `CommandRefused` if the device refused the command, else `DeviceFault`. Other errors as in `tell`.
         """
         reply = ""
         for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command

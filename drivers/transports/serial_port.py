@@ -37,15 +37,15 @@ _FOREIGN = (serial.SerialException, OSError, _termios_error)
 _SLICE_S = 0.02
 """One wait inside pyserial: the granularity of deadlines, in seconds."""
 _WRITE_S = 1.0
-"""Time for a write: a device that takes nothing for this long hangs. 1 s is 11 520 characters at 115 200 baud."""
+"""Longest time for all bytes of a write. 1 s is 11 520 characters at 115 200 baud."""
 BAUD = 115_200
 """Rate of a port whose device asks for no other."""
 AGAIN_S = 0.11
-"""Time between the same bytes sent again: a Cobolt ignores a command within 0.1 s of its last answer
+"""Pause after bytes that are sent several times: a Cobolt ignores a command within 0.1 s of its last answer
 (docs/reference/devices/cobolt.md)."""
 OFF_TIMES = 2
-"""Number of times that the bytes that switch a laser off are sent: it may ignore the first, since it may just have been
-asked something."""
+"""Number of times that the bytes which switch a laser off are sent. A laser may ignore the first time, if it has just
+answered a query."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 
@@ -100,15 +100,15 @@ class SerialPort:
         return None
 
     def write_again(self, data: bytes, times: int) -> None:
-        """Send `data` so many times, AGAIN_S after one another, to a device whose answers nobody reads. Errors as in
-        `write`.
+        """Send `data` several times, with a pause of AGAIN_S after each, to a device whose answers nobody reads. Errors
+        as in `write`.
         """
         for _ in range(times):
             self.write(data)
             self.clock.sleep(AGAIN_S)
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises `DeviceTimeout` if the device takes none for a second, or `DeviceDisconnected`."""
+        """Send all of `data`. Raises `DeviceTimeout` if that takes over a second, or `DeviceDisconnected`."""
         self._note(OUT, data)
         with self._translated():
             try:
@@ -216,7 +216,7 @@ class SerialPort:
 
 
 def configured_port(name: str, config: Any, ports: Mapping[str, Endpoint]) -> SerialPort:
-    """Open the port of a device's config, at the config's rate if it names one. Errors as those of `SerialPort`."""
+    """Open the port of a device's config, at the config's rate if it names one. Raises what `SerialPort` raises."""
     return SerialPort(name, resolve(config.port, ports), baud=getattr(config, "baud", BAUD))
 
 

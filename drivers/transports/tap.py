@@ -41,7 +41,7 @@ class TapFile:
         return cls(str(path.absolute()), time.monotonic_ns())
 
     def sync(self) -> None:
-        """Force what was written onto the disk."""
+        """Wait until what was written is on the disk. Raises OSError if that fails."""
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except FileNotFoundError:

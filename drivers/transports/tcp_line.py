@@ -47,7 +47,7 @@ class TcpStream:
             return str(self._socket.getpeername()[0])
 
     def send(self, data: bytes, deadline_s: float) -> None:
-        """Send all of `data`. Raises `DeviceTimeout` if the other side takes none for `deadline_s`, or
+        """Send all of `data`. Raises `DeviceTimeout` if the other side has not taken it within `deadline_s`, or
         `DeviceDisconnected`.
         """
         with self._translated():

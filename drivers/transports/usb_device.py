@@ -78,8 +78,8 @@ def usb_failure(
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """The ids of a kind of device. Unrelated devices use the same ids, so one of `product_names`, if any, must
-    be part of the product string, where that can be read, in upper or lower case."""
+    """The ids of a kind of device. Unrelated devices use the same ids. So if there are `product_names`, one of them
+    must be part of the product string, in upper or lower case; a string that cannot be read is not checked."""
 
     label: str
     vendor: int
@@ -237,7 +237,7 @@ def open_device(
     """Find, open, configure and claim a device.
 
     Raises `DeviceNotFound` if there is none, or none at that address; `DeviceError` if the address is malformed or fits
-    several; `DevicePermission`, with the udev rule; `DeviceBusy` if another program has claimed it.
+    several; `DevicePermission` if this user may not open it; `DeviceBusy` if another program has claimed it.
     """
     return UsbDevice(find_device(wanted, address, backend), wanted.label, alternates, tap)
 
@@ -298,5 +298,5 @@ def _libusb() -> Any:
 
 
 def milliseconds(timeout_s: float) -> int:
-    """The time in milliseconds, at least 1, since libusb takes 0 as 'for ever', which no call here may ask for."""
+    """The time in milliseconds, at least 1, because libusb takes 0 as 'for ever'."""
     return max(1, round(timeout_s * 1000))

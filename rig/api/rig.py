@@ -45,7 +45,7 @@ def devices() -> "list[Attached]":
 def laser_off(config: Config = SIMULATED) -> list[str]:
     """Set the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
 
-    Raises DevicesError if a device does not answer.
+    Raises DevicesError if a device fails or does not answer, or if the laser can only be switched off by hand.
     """
     from rig.devices.doctor import laser_off as switch_off
 

@@ -84,7 +84,8 @@ def plan_scan(
 
     on_estimator: called with the estimator and why it is used, in words. For `auto` it may state a condition: only
       `scan` measures whether `joint` keeps up with a stream.
-    Raises UsageError for a scan that cannot be made, and DevicesError, one line per device, for devices that fail.
+    Raises UsageError for a scan that cannot be made, and DevicesError (one line per device) or DeviceError if devices
+    fail.
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
@@ -165,7 +166,7 @@ def _listeners(
 
 
 def _new_run(settings: RigConfig, request: RunRequest) -> Run:
-    """Claim the run's folder. Raises UsageError with all problems of the request."""
+    """Claim the run's folder. Raises UsageError with all problems of the request, or if it cannot be claimed."""
     save = _checked(request, light_problems(settings, request.arm))
     scan, estimate = settings.scan, settings.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)

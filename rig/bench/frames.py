@@ -65,8 +65,8 @@ def count_columns(
 ) -> None:
     """Count whole columns of frames, one after the other, into bit planes that the next column reuses.
 
-    words: (all words,) of frames of `rows` rows; planes: see `new_planes`. Of each frame the chunks of rows
-    first_chunk..last_chunk-1 are counted. Turning planes into counts is part of an estimate and not done here.
+    words: (all words,) of frames of `rows` rows. exposures: frames per column. planes: see `new_planes`. Of each frame
+    the chunks of rows first_chunk..last_chunk-1 are counted. Turning planes into counts is part of an estimate.
     """
     frame = rows * row_words
     frames = words.shape[0] // frame

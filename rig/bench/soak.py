@@ -28,7 +28,7 @@ from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, walk_blocks
 from rig.bench.machine import machine
 from rig.config.files import load_config
-from rig.config.models import EstimateConfig
+from rig.config.models import MOST_THREADS, EstimateConfig
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
@@ -71,7 +71,7 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """A SPAD that plays a loop. timing, info: of the SPAD that took the loop's frames."""
+    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: of the SPAD to be played."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
@@ -187,7 +187,7 @@ CONFIG = "simulated"
 EXIT_DEVICE = 3
 """Exit code of a scan that the overload policy ended."""
 LOOP_S = 0.2
-"""Least time in s that the recorded sweeps last: many times what a cache holds."""
+"""Least time in s that the recorded sweeps last. Their frames take many times as much memory as a cache has."""
 DEPTH_RANGE = ["4 m", "15 m"]
 """Range whose stripes lie within 128 pixels of a row, the window for which speeds are stated."""
 LINK_MARGIN = 1.02
@@ -261,11 +261,10 @@ def soak(
 ) -> SoakReport:
     """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
 
-    window: send windows that move with the line instead of whole frames.
-    slow_consumer_s: time added to every map, to see what an overload does.
-    on_overload: as in `rig.api.scan`; a stream that is ended by it gives a report too.
-    estimator, exposures: by name; per column, None for those of the bundled rig.
-    progress: called with frames done and frames planned.
+    threads: 1 to 256 that count and estimate; None for one per core. window: send windows that move with the line, not
+    whole frames. slow_consumer_s: time added to every map, to see what an overload does. on_overload: as in
+    `rig.api.scan`; a stream that is ended by it gives a report too. estimator: its name. exposures: frames per column;
+    None for those of the bundled rig. progress: called with frames done and frames planned.
 
     Raises UsageError for invalid arguments.
     """
@@ -284,6 +283,8 @@ def soak(
     )
     if estimator not in ESTIMATORS:
         raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if threads is not None and not 1 <= threads <= MOST_THREADS:
+        raise UsageError(f"{threads} threads were asked for; give 1 to {MOST_THREADS}")
     with _looped_rig(policy, window, exposures) as (rig, spad), _quiet_sweeps():
         plan, timing = prepare(rig)
         maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
@@ -308,7 +309,7 @@ def _quiet_sweeps() -> Iterator[None]:
 
 @contextmanager
 def _looped_rig(policy: Overload, window: bool, exposures: int | None) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; gives that SPAD too."""
+    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD."""
     # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {
         "scanner.clock_error": "0 ppm",
@@ -333,7 +334,7 @@ def _window_bytes_per_s(settings: dict[str, object]) -> float:
 
 
 def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
-    """Record sweeps of the simulated rig; so many that together they take a whole number of frames."""
+    """Record sweeps of the simulated rig, so many that together they take a whole number of frames."""
     whole = plan.frames_per_sweep.denominator
     sweeps = math.ceil(math.ceil(LOOP_S / float(plan.sweep_s)) / whole) * whole
     with tempfile.TemporaryDirectory(prefix="spadrig-bench-") as folder:

@@ -47,7 +47,7 @@ READ_EVERY = 12
 WINDOWS = (64, 128, 256, 512)
 EXPOSURES = (1, 5, 10, 20, 50)
 COUNT_EXPOSURES = (1, 3, 5, 10, 15, 20, 50)
-"""Exposures at which counting alone is measured: its speed is claimed for 3 to 15 and beyond."""
+"""Exposures at which counting alone and `numpy` are measured, in addition to those of the `Extent`."""
 WINDOW = 128
 """Window, in px, of the rows that are measured at one window only."""
 FEW_EXPOSURES = (1, 10)
@@ -185,7 +185,7 @@ def measure_speed(
 ) -> SpeedReport:
     """Measure all rows and the latency.
 
-    threads: the largest number, by default one for each core. progress: called with the number of rows done and of all.
+    threads: the largest number; None for one per core. progress: called with rows done and the total, over all rounds.
     """
     begun = time.perf_counter()
     extent = extent or Extent()
@@ -266,9 +266,8 @@ def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, ex
 def _usual_cases(
     frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent, folder: Path
 ) -> list[Case]:
-    """Cases of the usual window only, all of `likelihood`: one that works at the end of sweeps, one with whole
-    frames, and one with frames from a recording.
-    """
+    """The rows of the usual window only, all of `likelihood`: with whole sweeps, with whole frames, with frames from a
+    recording."""
     few = [k for k in FEW_EXPOSURES if k in extent.exposures]
     full = full_frames(frames, extent.frames_bytes)
     walk, full_walk = Walk(frames), Walk(full)

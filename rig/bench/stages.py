@@ -331,10 +331,8 @@ def _timed(
     beside: Callable[[], object] | None = None,
     maps: int = 1,
 ) -> Measured:
-    """Make maps of `frames` frames each for `seconds`. beside: called after each map, at least PAIRS times.
-
-    maps: made by each call of `make`.
-    """
+    """Make maps of `frames` frames each for `seconds`. beside: called after each call of `make`, at least PAIRS times.
+    maps: number of maps made by each call of `make`."""
     spent: list[float] = []
     quotients: list[float] = []
     while sum(spent) < seconds or len(spent) < (1 if beside is None else PAIRS):

@@ -70,7 +70,7 @@ def calibrate_camera(
 
 
 def _fitted(session: Session, board: Board, terms: int) -> CameraFit:
-    """Fit the camera. Raises Degenerate if fewer than FEWEST_VIEWS views could be used."""
+    """Fit the camera. Raises Degenerate as `fit_camera` does, and if it could use fewer than FEWEST_VIEWS views."""
     fit = fit_camera(session.views, board, session.size, distortion_terms=terms)
     if len(fit.kept) < FEWEST_VIEWS:
         raise Degenerate(

@@ -2,9 +2,9 @@
 
 `capture_view` scans a live rig, `capture_recorded` reads a recorded run. An existing calibration is not used in the
 scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command at the instant
-when the line's centre crosses a pixel, stated as if the mirror had no lag. If a SPAD cannot send or keep whole frames
-fast enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag.
-Windows and lag do not change the passages, except that a line outside the windows is not seen.
+when the line's centre crosses a pixel: as sent, not corrected for lag. If a SPAD cannot send or keep whole frames fast
+enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag. Windows
+and lag do not change the passages, except that a line outside the windows is not seen.
 
 Passages are kept for pixels spread evenly over the board, away from printed edges, or over the whole picture if no
 board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still accelerating
@@ -13,8 +13,8 @@ then.
 `shown` brings the board to the wanted pose: a person is asked to hold it there, or the simulated world moves it.
 `SpeedRotation` scans successive poses at different numbers of exposures per column, so that the mirror is seen at
 several speeds. A speed that the rig cannot do is left out. If the line cannot be found on the board at some speed, the
-pose is scanned again at the slowest speed before the board is moved. If the line is found then and was never found at
-the faster speed, that speed is left out too.
+pose is scanned again at the slowest speed before the board is moved. If the line is found then, but never was at the
+faster speed, the faster speed is left out too.
 """
 
 from collections.abc import Callable, Sequence
@@ -61,7 +61,7 @@ MOST_SWEEPS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A view, the reason why it has no corners (None if it has, or none were sought), and the rig that took it."""
+    """A view, the reason why it has no corners (None if it has some or none were sought), and the rig that took it."""
 
     view: View
     refused: Degenerate | None
@@ -81,7 +81,7 @@ def capture_view(
 ) -> Capture:
     """Scan once, in both directions, and take the view.
 
-    board: None if there is none; passages are then of the whole picture.
+    board: None if there is none; passages are then kept over the whole picture.
     seed: of everything simulated.
     exposures: per column; None: the config's.
     arm: must be True if laser or gate are real.
@@ -104,7 +104,7 @@ def capture_view(
 
 
 def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDArray[np.bool_] | None = None) -> Capture:
-    """Take the view from the first sweeps of a recorded run. Raises UsageError if it cannot be replayed."""
+    """Take the view from the first sweeps of a recorded run. Raises what `replay_config` and `open_rig` do."""
     config = replay_config(run, ReplayRequest(clock="max", estimator="argmax", filter="none"))
     if not read_plan(run).windowed:
         config = config.model_copy(update={"calibration": None})
@@ -114,13 +114,13 @@ def capture_recorded(run: Path, name: str, board: Board | None, *, defects: NDAr
 
 
 def plain(config: RigConfig) -> RigConfig:
-    """The config of a scan for its counts alone, with an estimator that keeps all counts."""
+    """The config with an estimator that keeps all counts, for scans of which only the counts are used."""
     update = {"estimator": "argmax", "filter": "none", "temporal_prior": False}
     return config.model_copy(update={"estimate": config.estimate.model_copy(update=update)})
 
 
 def _settings(config: RigConfig, exposures: int | None) -> RigConfig:
-    """The config of a capture. Raises UsageError for a rig of several lines."""
+    """The config of a capture. Raises UsageError for a rig of several lines or a wrong number of exposures."""
     if len(config.line_offsets) > 1:
         raise UsageError(
             f"{config.name} has {len(config.line_offsets)} lines (line_offsets); a pixel cannot tell which one passed: "
@@ -196,7 +196,7 @@ def _leg(plan: ScanPlan, direction: int) -> Leg:
 
 
 def _steady(passages: Passages, plan: ScanPlan) -> Passages:
-    """The passages at least MOST_LAG_S after the sweep's start, when the mirror moves at full speed."""
+    """The passages from MOST_LAG_S after the sweep's start on, when the mirror moves at full speed."""
     first = plan.command_range[0 if _leg(plan, passages.direction).columns_rise else 1]
     since_s = passages.direction * (passages.command - first) / passages.speed_per_s
     keep = since_s >= MOST_LAG_S
@@ -219,7 +219,7 @@ def corners_in(
 TellLine = Callable[[str], None]
 """A callback that takes a line for people."""
 AskPerson = Callable[[str], None]
-"""A callback that asks a person to move the board as a text says, and waits. KeyboardInterrupt ends the session."""
+"""A callback that asks a person to move the board as the text says, and waits until that is done."""
 
 
 def world_moves_board(config: RigConfig) -> bool:
@@ -238,8 +238,8 @@ def with_board_pose(config: RigConfig, pose: BoardPose) -> RigConfig:
 
 
 def require_live(config: RigConfig | None, ask: AskPerson | None, arm: bool) -> None:
-    """Raise UsageError if a live rig is not allowed to emit light, or if nobody can move its board. None means no live
-    rig.
+    """Raise UsageError if a live rig is not allowed to emit light, or if nobody can move its board. config: None if
+    there is no live rig; nothing is raised then.
     """
     if config is None:
         return
@@ -269,7 +269,7 @@ Scan = Callable[..., Capture]
 
 
 class SpeedRotation:
-    """Takes successive views at different speeds in turn."""
+    """Takes successive views at different speeds in turn (see the module)."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
         """exposures: numbers per column that take turns; empty: the config's. sees: whether a capture shows enough of
@@ -280,7 +280,7 @@ class SpeedRotation:
         self._shown: set[int] = set()
 
     def capture(self, pose: int, scan: Scan) -> Capture:
-        """Take the view of a pose at the speed whose turn it is. pose: its number, which determines the speed."""
+        """Take the view of pose number `pose` at the speed whose turn it is. Raises PlanError if none can be done."""
         while True:
             exposures = self.turns[pose % len(self.turns)] if self.turns else None
             try:
@@ -299,7 +299,7 @@ class SpeedRotation:
         return capture
 
     def _again(self, capture: Capture, exposures: int, slowest: int, scan: Scan) -> Capture:
-        """Take the pose again at the slowest speed; return the first capture if the rig cannot do that."""
+        """Take the view again at the slowest speed; return the first capture if the rig cannot do that speed."""
         self._tell(f"at {_of(exposures)} the line does not stand out on the board: again at {slowest}")
         try:
             again = scan(exposures=slowest)

@@ -1,4 +1,4 @@
-"""`rig calibrate check`: judges a calibration by scans of a flat board that was not used for it."""
+"""`rig calibrate check`: judges a calibration by views of a flat board from which it was not made."""
 
 import math
 from collections.abc import Sequence
@@ -45,13 +45,12 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by a flat board that was not used for it (`rig calibrate check`).
+    """Judge a calibration by views of a flat board from which it was not made (`rig calibrate check`).
 
-    If the calibration states its rig, the result is noted beside its file. After a failed check, scans refuse the
-    calibration.
+    If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
 
-    Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, and UsageError for a
-    wrong request and for views that the calibration was made from.
+    Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, UsageError for a wrong
+    request and for views that the calibration was made from, and OSError if the result cannot be noted.
     """
     request = replace(request or CheckRequest(), **changes)
     values = si_values(request)
@@ -112,7 +111,7 @@ def _require_others(views: Sequence[View], model: RigModel) -> None:
 
 
 def _with_board(session: Session, least: int) -> list[View]:
-    """The views that show the board. Raises Degenerate, with the problem of each view, if they are too few."""
+    """The views that show the board. Raises Degenerate, with notes as by `note_views`, if fewer than `least` do."""
     views = [view for view in session.views if view.corners is not None]
     if len(views) < least:
         reason = next((why.reason for why in session.refused.values()), "no-board")
@@ -138,7 +137,7 @@ def _summary(
 
 
 def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
-    """Say what a failed check changes from now on and how to undo that; nothing for a calibration without identity."""
+    """What a failed check changes and how to undo it; empty if it passed or the calibration does not state its rig."""
     if verdict.passed or model.identity is None:
         return []
     said = (

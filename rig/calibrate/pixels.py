@@ -1,8 +1,8 @@
 """`rig calibrate pixels`: maps the pixels from dark frames and compares the map with the last one.
 
-Dark frames come from the SPAD alone or from a recorded run, lit ones from a scan or a run. In the dark nothing moves
-and no light leaves: the gate is low, the laser is not armed, the scanner rests. The frames come in short starts
-spread over some time, since the rate of a noisy pixel may jump within milliseconds or only within minutes.
+Dark frames come from the SPAD alone or from a recorded run, lit ones from a scan or a run. For dark frames nothing
+moves and no light leaves: the gate is low, the laser is not armed, the scanner rests. They come in short starts of the
+SPAD spread over some time, since the rate of a noisy pixel may jump within milliseconds or only within minutes.
 
 The folder has pixels.npz (the map with its version), calibration.yaml (that of the config, if any, with the new defects
 and dark rates), dark_rate.png, report.html and summary.json. The statistics are in `calibration.pixel_map`.
@@ -52,7 +52,7 @@ from rig.scan.source import Source, blocks
 from rig.threads import RowWorkers
 
 STARTS: Final = 32
-"""Starts of the SPAD; the counts of each are one block of the statistics. More if its memory holds too few frames."""
+"""Starts of the SPAD; the counts of each are one block of the statistics. More if its memory is too small for that."""
 BLOCK_FRAMES: Final = 128
 SPARE_SLOTS: Final = 4
 """Slots of the ring beyond those needed, so that nothing is lost if a device sends shorter blocks than requested."""
@@ -61,7 +61,7 @@ SPREAD_S: Final = 10.0
 """Seconds from the first start to the last one."""
 
 Sums = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""Ones and frames of every pixel, (rows, width) each."""
+"""For every pixel (rows, width): the number of frames in which it fired, and of all frames that contained it."""
 
 
 @runtime_checkable
@@ -69,7 +69,7 @@ class CoversLens(Protocol):
     """A world that can cover the lens."""
 
     def cover_lens(self) -> None:
-        """Let no light in any more."""
+        """Let no light in from now on."""
         ...
 
 
@@ -81,7 +81,7 @@ class SweepSums:
     lit: Sums | None = None
 
     def add(self, sweep: SweepData) -> None:
-        """Add a sweep; its dark frames count as one block. A sweep without dark frames or kept counts is left out."""
+        """Add a sweep; its dark frames are one block of the statistics. Without dark frames or counts it is ignored."""
         volume = sweep.tally
         if not isinstance(volume, CountVolume) or volume.dark_counts is None:
             return
@@ -100,9 +100,9 @@ def take_dark(
     progress: Progress | None = None,
     covered: Callable[[], None] | None = None,
 ) -> tuple[pixel_map.DarkTally, float]:
-    """Take at least `frames` frames in the dark; return their tally and exposure in s.
+    """Take `frames` frames in the dark, or a few more for equal starts; return their tally and exposure in s.
 
-    covered: called first, so that a person covers the lens; a world that can cover it does so instead. May raise
+    covered: called first, so that a person covers the lens; not called if the rig's world covers it. May raise
     DeviceError.
     """
     if isinstance(rig.world, CoversLens):
@@ -138,8 +138,8 @@ def take_dark(
 
 
 def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None = None) -> SweepSums:
-    """Take the frames of a scan with light, or of all sweeps of a recording. An interrupt is raised again at
-    the end. Raises UsageError if no sweep has dark frames."""
+    """Take the frames of a scan with light, or of a recording. maps: number of sweeps; None: all of the recording. An
+    interrupt is raised again at the end. Raises UsageError if no sweep has dark frames."""
     sums = SweepSums()
 
     def live(now: ScanProgress) -> None:
@@ -153,7 +153,7 @@ def take_sweeps(rig: OpenRig, maps: int | None = None, progress: Progress | None
 
 
 def _request(scan: ScanConfig, info: SpadInfo, frames: int) -> SpadRequest:
-    """Request for full frames of the scan's exposure, as fast as the link carries them."""
+    """Request for full frames of the scan's exposure and rate, or slower if the link carries less."""
     rate = Fraction(scan.frame_rate)
     if info.stream is not None:
         rate = min(rate, Fraction(math.floor(info.stream.bytes_per_s / frame_bytes(info.width, info.height))))
@@ -177,7 +177,7 @@ def _blocks(rig: OpenRig, frames: int, stride: int, block_frames: int) -> Iterat
 
 
 def _frames_in_windows(volume: CountVolume) -> NDArray[np.int64]:
-    """Frames (width,) in which each pixel of a row lay within the counted window."""
+    """Number of frames (width,) in which each pixel of a row lay within the counted window."""
     window = volume.counts.shape[2]
     change = np.zeros(max(volume.width, int(volume.x0.max(initial=0)) + window) + 1, np.int64)
     np.add.at(change, volume.x0, volume.n_frames)
@@ -210,7 +210,7 @@ class PixelResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 1 if the map cannot be trusted or the last one no longer holds."""
+        """Exit code of the command line: 0, or 1 if this map cannot be trusted or the older one does not hold."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -259,7 +259,7 @@ class PixelResult:
 
 
 def pixel_verdict(pixels: pixel_map.PixelMap, drift: pixel_map.PixelDrift | None, leak: float) -> Verdict:
-    """Judge whether the map may be believed and the older one still holds; the root cause comes first."""
+    """Judge whether the map may be believed and, if there is a drift, the older one still holds. Root cause first."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
@@ -302,7 +302,7 @@ _log = logging.getLogger(__name__)
 
 PIXELS_FILE: Final = "pixels.npz"
 LIT_FRAMES: Final = 100
-"""Exposures taken with the line on each pixel: enough to judge a pixel that should fire in a third of them."""
+"""Frames taken with the line on each pixel: enough to judge a pixel that should fire in a third of them."""
 
 
 def calibrate_pixels(
@@ -313,10 +313,10 @@ def calibrate_pixels(
     progress: Progress | None = None,
     **changes: Any,
 ) -> PixelResult:
-    """Map hot, dead and noisy pixels and the dark rate from dark frames (`rig calibrate pixels`).
+    """Map hot and noisy pixels and the dark rate from dark frames, dead ones from lit frames (`rig calibrate pixels`).
 
     source: a rig, or the folder of a recorded run.
-    covered: called when a person has to cover the lens; it returns once that is done.
+    covered: called when a person has to cover the lens; it must return once that is done.
     Raises UsageError for a wrong request or file, DeviceError or DevicesError if devices fail.
     """
     request = replace(request or PixelsRequest(), **changes)
@@ -362,7 +362,7 @@ def calibrate_pixels(
 
 
 def _recorded_sums(run: Path, progress: Progress | None) -> tuple[pixel_map.DarkTally, Sums | None, str]:
-    """Dark and lit sums of a recording's sweeps, and the sensor that took them."""
+    """Dark and lit sums of a recording's sweeps, and the name of the sensor that took them."""
     with open_rig(plain(replay_config(run, ReplayRequest(clock="max")))) as rig:
         sums, sensor = take_sweeps(rig, progress=progress), _sensor(rig)
     assert sums.tally is not None, "else it would have been refused"
@@ -374,7 +374,7 @@ def _sensor(rig: OpenRig) -> str:
 
 
 def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) -> pixel_map.PixelVersion | None:
-    """The older map to compare with; None if there is none. Raises UsageError if its file holds no map."""
+    """The older map: `against`, or that beside a live rig's calibration, or None. Raises UsageError if damaged."""
     if against is not None:
         path = Path(against)
         path = path / PIXELS_FILE if path.is_dir() else path
@@ -391,7 +391,7 @@ def _last(against: PathLike | None, config: RigConfig, recorded: Path | None) ->
 
 
 def _note(config: RigConfig, drift: pixel_map.PixelDrift) -> None:
-    """Note beside the config's calibration whether its older map of the pixels still holds."""
+    """Note beside the config's calibration whether its older pixel map holds. A failure to write is only logged."""
     assert config.calibration is not None, "the older map lies beside it"
     try:
         model = load_rig_model(config.calibration)

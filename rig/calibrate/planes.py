@@ -1,4 +1,4 @@
-"""`rig calibrate planes`: calibrates the whole rig, camera, mirror and lag together, from views of a board.
+"""`rig calibrate planes`: calibrates the whole rig (camera, mirror and lag) in one fit, from views of a board.
 
 In the guided mode (`guided`) the rig is fitted after each view, and the next pose is the one that lowers the expected
 error most.
@@ -50,9 +50,9 @@ def calibrate_planes(
 ) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
-    The defects of the request's `calibration` are kept. Raises Degenerate, with notes why, if the views give no model,
-    CalibrationError if a file cannot be used or the line does not reach the distance `at`, UsageError for a wrong
-    request.
+    The fit starts from the request's `calibration`, if there is one, and keeps its defects. Raises Degenerate, with
+    notes why, if the views give no model, CalibrationError if a file cannot be used or the line does not reach the
+    distance `at`, UsageError for a wrong request.
     """
     request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
@@ -98,7 +98,7 @@ def calibrate_planes(
 
 
 def speeds_of(live: RigConfig) -> tuple[int, ...]:
-    """Numbers of exposures per column for a rig's views, to be used in turn."""
+    """Numbers of exposures per column for a rig's views, used in turn, by `SPEEDS`."""
     return tuple(dict.fromkeys(max(least, round(times * live.scan.exposures)) for times, least in SPEEDS))
 
 
@@ -122,7 +122,7 @@ def _judged(session: Session, values: Mapping[str, float], fit: RigFit) -> Judge
 
 
 def _signed(fit: RigFit, judged: JudgedRig, identity: Identity | None, digests: list[str]) -> RigModel:
-    """The model with its verdict, its rig, and the digests of its corners, which must not be used to check it."""
+    """The model with its verdict, its rig, and the digests of the corners it was made from: no check may use these."""
     verdict = judged.verdict
     created = datetime.now(UTC).isoformat(timespec="seconds")
     if identity is not None:
@@ -207,7 +207,7 @@ def _figures(
 
 
 START_POSES = 3
-"""Number of poses that are shown before anything is fitted."""
+"""Fewest views of a session before anything is fitted."""
 
 
 def guided(
@@ -217,7 +217,7 @@ def guided(
     """Return a function that chooses the pose which lowers the expected error most, until the verdict passes or no
     pose is left.
 
-    start: chooses the poses until a fit of the session's views can be judged. fit, judge: those of the final result.
+    start: chooses the poses until a fit of the session's views can be judged. fit, judge: as for the final result.
     """
     asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 

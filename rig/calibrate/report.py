@@ -1,8 +1,8 @@
-"""Writes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
+"""Makes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
 `planes_report`, `camera_report`, `check_report` and `sync_report` make the parts of a report: tables, pictures and
-charts. `page` makes the file, which loads nothing from elsewhere. Numbers have units and only the digits that are
-known. `subject` says what a report is about, so that printed reports are not confused.
+charts. `page` makes the file from these, `pixel_page` that on a pixel map; files load nothing from elsewhere. Numbers
+have units and only the digits that are known. `subject` says what a report is about, so that prints are not confused.
 """
 
 import base64
@@ -55,7 +55,7 @@ Rows = Sequence[tuple[str, str]]
 
 
 def page(report: Report, verdict: Verdict, line: str, rows: Rows) -> str:
-    """Make the HTML file: verdict with its reasons, a summary line, a table of the rows, the sections."""
+    """The text of the HTML file: verdict with the summary line and its reasons, a table of `rows`, the sections."""
     title, sections = report
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
@@ -105,11 +105,11 @@ _UNITS = {
     "offset_0": ("mm", 1e3), "offset": ("mm/rad^{order}", 1e3),
     "lag": ("us", 1e6), "row_delay": ("ns/row", 1e9),
 }  # fmt: skip
-"""Unit of each term of the model, and how many of these units make one SI unit. The mirror command has no unit."""
+"""Unit of each kind of term of the model, and how many such units make one SI unit. The mirror command has no unit."""
 
 
 def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
-    """Value and standard deviation of a model's term, rounded to two digits of the latter, and their unit."""
+    """Value, sd and unit of a model's term as text, with two digits of the sd; '-' for what is not known."""
     first = name.split("/", maxsplit=1)[0]
     kind, _, order = first.rpartition("_") if first[-1].isdigit() else (first, "", "")
     unit, times = next((_UNITS[key] for key in (first, kind, kind.split("_")[0]) if key in _UNITS), ("", 1.0))
@@ -121,7 +121,7 @@ def measured(name: str, value: float, sd: float) -> tuple[str, str, str]:
 
 
 def named(names: Sequence[str]) -> str:
-    """The number of these names, followed by the names, as text."""
+    """The number of names, followed by the names, as text."""
     return f"{len(names)} ({', '.join(names)})" if names else "0"
 
 
@@ -154,13 +154,12 @@ ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 
 
 def view_colour(view: int) -> tuple[int, int, int]:
-    """Colour (BGR) of the view with this number, in all pictures and charts."""
+    """Colour (BGR) of a view in all pictures and charts, by its place among the views."""
     return _COLOURS[view % len(_COLOURS)]
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """Draw the deviations of a board's squares from their plane: red in front of it, black where they were not
-    scanned."""
+    """Draw deviations of a board's squares from their plane, (squares down, across): red in front, black where NaN."""
     large = _enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
@@ -181,8 +180,8 @@ _WAYS = {1: "rising command", -1: "falling command"}
 
 
 def plane_residuals(judged: JudgedRig, sweeps: Sequence[SweepFit]) -> str:
-    """Chart (SVG) of each sweep's median residuals against the mirror command, with one panel for each direction of
-    sweep. Residuals are in mm of depth at the distance for which the accuracy was asked. Empty without sweeps.
+    """Chart (SVG) of each sweep's residuals (medians over bins of the mirror command), with a panel for each direction
+    of sweep. They are in mm of depth at the distance for which the accuracy was asked. Empty without sweeps.
     """
     views, waves = list(dict.fromkeys(sweep.view for sweep in sweeps)), judged.waves
 
@@ -219,8 +218,8 @@ def planes_report(fit: RigFit, views: Sequence[View], judged: JudgedRig) -> Repo
 
 
 def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequence[Array]) -> list[Section]:
-    """Sections that show where corners were seen, with the views' colours and names, and their distances from the
-    model's corners as enlarged arrows.
+    """Two sections: where corners were seen, with the views' colours and names; and enlarged arrows from there to where
+    the model puts the corners. residuals_px: (n, 2) of each view's corners, projected minus seen.
     """
     scale = _WIDTH_PX / camera.width
     coverage = np.full((round(camera.height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
@@ -246,7 +245,7 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
-    """Section with a map of the expected depth error, red where it is large, black where the scan does not reach."""
+    """Section with a picture of the expected depth error: red where it is large, black where no scan reaches."""
     if not np.isfinite(uncertainty.sd_m).any():
         return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
@@ -310,7 +309,7 @@ def sync_report(fit: SyncFit) -> Report:
 
 
 def corners_px(view: View) -> Array:
-    """Corners of a view (n, 2), without those at invalid positions."""
+    """Corners of a view in pixels, float64 (n, 2), without those that are not finite."""
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)
@@ -361,8 +360,8 @@ _DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates as a picture (rows, width, 3) BGR, logarithmic from a third of the usual rate on; dead pixels are
-    black.
+    """Dark rates as a picture, uint8 BGR (rows, width, 3): logarithmic, from a third of the ordinary rate upwards; dead
+    pixels are black.
     """
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
@@ -381,8 +380,8 @@ def pixel_page(
     drift: PixelDrift | None,
     against: PixelVersion | None,
 ) -> str:
-    """Make the report on a map of the pixels: the map, the distribution of rates beside the older one, and the
-    changes."""
+    """The text of the HTML file on a pixel map: dark rates, their distribution beside that of the older map `against`,
+    and what changed since (`drift`). Both are None without an older map."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
     caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
@@ -403,7 +402,7 @@ def pixel_page(
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:
-    """Chart (SVG) of the number of pixels by dark rate, with the limit above which they are hot."""
+    """Chart (SVG) of the number of pixels by dark rate, with the median of the limits that hot pixels exceed."""
     maps = [(pixels, "this map", _NEW), *([(older, "the last one", _OLD)] if older is not None else [])]
     rates = [one.rate_per_s[np.isfinite(one.rate_per_s)].astype(np.float64) for one, _, _ in maps]
     # Pixels that never fired are shown at half a count.

@@ -5,7 +5,7 @@
 
 `Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. A session that was
 interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
-`views/000.npz`, has all that a fit needs of a pose. It is written completely or not at all:
+`views/000.npz`, has all that a fit needs. It is written completely or not at all:
 
     format_version () int   name () str   picture (height, width) float32, if there is one
     corner_ids (n,) int32   corner_px (n, 2) float64   corner_sd_px (n,) float64, if the board was found
@@ -52,7 +52,7 @@ BOARD_FILE = "board.yaml"
 
 
 def session_rig(folder: Path) -> Identity | None:
-    """The rig of a session's views, from its file rig.json; None without one. Raises UsageError if it is damaged."""
+    """The rig of a session's views, from its file rig.json; None without that. Raises UsageError if it is damaged."""
     try:
         content = parse_json((folder / RIG_FILE).read_text(encoding="utf-8"))
         return Identity(**{**content, "reasons": tuple(content["reasons"])})
@@ -86,7 +86,7 @@ class CalibrationResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command line: 0 for a usable calibration, 1 if its verdict failed."""
+        """Exit code of the command line: 0 if the verdict passed, else 1."""
         return 0 if self.verdict.passed else EXIT_NOT_TRUSTWORTHY
 
     def rows(self) -> list[tuple[str, str]]:
@@ -101,8 +101,8 @@ class CalibrationResult:
 class Session:
     """The views of a calibration, written one by one as they are taken, and then its result.
 
-    views: those taken so far. refused: why no corners were found in a view, by the view's name. identity: the rig they
-    belong to (None if unknown).
+    views: those taken so far. refused: why no corners were found in a view, by the view's name. identity: the rig of
+    the views; None if unknown.
     """
 
     def __init__(
@@ -112,10 +112,10 @@ class Session:
         tell: TellLine | None = None,
         of_camera: Collection[str] = (),
     ) -> None:
-        """Claim the folder; None writes nothing. Raises UsageError if it cannot be claimed.
+        """Claim the folder `out`; if it is None, nothing is written. Raises UsageError if it cannot be claimed.
 
-        board: what the views show. tell: gets a line on each view. of_camera: digests of the views that a known camera
-        was made of, which must not be used again.
+        board: what the views show. tell: gets a line on each view. of_camera: digests of the views from which a known
+        camera was made; they must not be used again.
         """
         self.views: list[View] = []
         self.refused: dict[str, Degenerate] = {}
@@ -128,7 +128,7 @@ class Session:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the pictures. Raises UsageError if views differ in size."""
+        """(width, height) of the pictures. Raises UsageError if they differ in size or there are none."""
         sizes = {view.picture.shape[::-1] for view in self.views if view.picture is not None}
         if len(sizes) != 1:
             named = ", ".join(f"{width} x {height}" for width, height in sorted(sizes)) or "none"
@@ -143,7 +143,7 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Keep the folder if it has a view; a note on the error, if there is one, says where the views are."""
+        """Keep the folder if it has a view, else remove it. A note on the error, if any, says where the views are."""
         if self._folder is None:
             return
         if self.views:
@@ -169,8 +169,8 @@ class Session:
         identity: Identity | None = None,
         source: Path | None = None,
     ) -> None:
-        """Add a view; if its name is taken, it gets another one. Raises UsageError for a view that would count twice or
-        is of another rig, and if it cannot be written. source: file or run that the view comes from."""
+        """Add a view and write it; if its name is taken, it gets another. Raises UsageError for a view that would count
+        twice or is of another rig, and if it cannot be written. source: file or run that the view comes from."""
         self._require_new(view, str(source or view.name))
         if view.name in [known.name for known in self.views]:
             view = replace(view, name=f"{view.name}-{len(self.views)}")
@@ -216,16 +216,16 @@ class Session:
             save_view(view, folder / f"{len(self.views):03d}.npz")
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file of text."""
+        """Write a file of text, if there is a folder."""
         if self._folder is not None:
             self._folder.write_text(name, text)
 
     def finish(
         self, command: str, result: CalibrationResult, report: Report, made_from: LoadedCalibration | None = None
     ) -> CalibrationResult:
-        """Write the result and its model, if it has one. Failed checks of `made_from` are noted on the new model too.
+        """Write the result, its report and its model, if it has one. Notes on failed checks of `made_from` are copied.
 
-        Returns the result with its whole summary and with the paths of what was written.
+        Returns the result with its whole summary and, if there is a folder, the paths of what was written.
         """
         summary = {"command": command, **result.summary, "versions": versions()}
         result = replace(result, summary=summary)
@@ -277,7 +277,7 @@ def told(view: View, refused: Degenerate | None) -> str:
 
 
 def true_model(live: RigConfig | None) -> RigModel | None:
-    """The true rig model, from the simulated rig's world; None for a real rig. Called only after all estimates."""
+    """The true rig model, from a world that knows it; None for a real rig. Call it only after all estimates."""
     if live is None or live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:
@@ -285,7 +285,7 @@ def true_model(live: RigConfig | None) -> RigModel | None:
 
 
 def true_errors(model: RigModel, live: RigConfig | None, at_m: float) -> DepthErrors | None:
-    """True depth errors, from the rig's world; None for a real rig."""
+    """True depth errors of `model` at the distance `at_m`, against `true_model`; None if that is None."""
     truth = true_model(live)
     if truth is None:
         return None
@@ -294,7 +294,7 @@ def true_errors(model: RigModel, live: RigConfig | None, at_m: float) -> DepthEr
 
 
 def truth_content(errors: DepthErrors | None) -> dict[str, Any] | None:
-    """The true errors as plain values for the summary."""
+    """The true errors as plain values for the summary; None if there are none."""
     if errors is None:
         return None
     return {"at_m": errors.depth_m, "median_m": errors.median_m, "worst_m": errors.worst_m, "ratio_to_sd": errors.ratio}
@@ -305,7 +305,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def save_view(view: View, file: Path) -> None:
-    """Write a view in one step. Raises UsageError if it cannot be written."""
+    """Write a view, completely or not at all. Raises UsageError if it cannot be written."""
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **_arrays(view))
     part = file.with_name(f".{file.name}.part")

@@ -31,8 +31,8 @@ SourcesLike = Config | Sequence[Config]
 
 @dataclass(frozen=True, slots=True)
 class ViewSources:
-    """Sources of views in the order in which they were named; the rig, if any, that takes new ones; and messages about
-    them.
+    """Sources of views. live: rig that takes new ones; None without one. sessions: folders of earlier calibrations.
+    recorded: folders of runs. pictures: files. notes: lines for the user.
     """
 
     live: RigConfig | None
@@ -45,8 +45,8 @@ class ViewSources:
 def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
     """Find out what each source is. Without any, the bundled simulated rig is used.
 
-    scene: for a simulated rig; None means its own scene or, if that has no board, the bundled scene 'board'. Raises
-    UsageError with a line per problem, DeviceError if a scene cannot be read.
+    pictures: whether picture files are allowed. scene: for a simulated rig; None means its own scene or, if that has no
+    board, the bundled scene 'board'. Raises UsageError with a line per problem, DeviceError for an unreadable scene.
     """
     live, problems, notes = list[RigConfig](), list[str](), list[str]()
     sessions, recorded, found = list[Path](), list[Path](), list[Path]()
@@ -95,7 +95,7 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
 
 
 def _live(source: Config, scene: str | None, notes: list[str]) -> RigConfig:
-    """The config of a rig. A note is added if a simulated rig is shown another scene than its own."""
+    """The config of a rig. If a simulated rig's scene has no board, it is replaced and a note is added."""
     loaded = configure(source, scene=scene)
     world = loaded.world
     if scene is not None or world is None or "board_pose" not in type(world).model_fields:
@@ -117,8 +117,8 @@ _QUANTITIES = {
 
 
 def si_values(request: CalibrationRequest) -> dict[str, float]:
-    """The quantities that a request states, in SI units. Raises UsageError with a line for each that is wrong,
-    and for wrong exposures, poses and seeds."""
+    """The quantities that a request states, in SI units, by the names in `_QUANTITIES`. Raises UsageError with a line
+    for each that is wrong, and for wrong exposures, poses and seeds."""
     exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses < 1:
@@ -142,9 +142,9 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
 
 
 def known_camera(file: Path, *, accept: bool = False) -> tuple[KnownCamera, list[Refusal]]:
-    """Read a camera file; return the camera and the reasons of its failed verdict, if it is used in spite of one.
+    """Read a camera file; return the camera and the accepted reasons against it; empty if it has not failed.
 
-    accept: whether to use a camera whose verdict failed. Raises UsageError if it failed and is not accepted, and
+    accept: whether to use a camera whose verdict is 'failed'. Raises UsageError for one that is not accepted, and
     CalibrationError if the file is no camera file. A camera without a verdict is used.
     """
     known = load_camera(file)

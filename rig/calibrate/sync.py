@@ -55,9 +55,9 @@ SETTLED_FRAMES = 3
 MOST_LATE_FRAMES = 3
 """Longest delay that is looked for, in frames; gates take microseconds."""
 MOST_SCATTER = 10.0
-"""Most variance of the ones around an edge, in units of photons' variance; more comes from the scene."""
+"""Largest variance of the frames' counts around a fitted edge, in units of photon noise; more comes from the scene."""
 STEPS = 32
-"""Delays tried per frame."""
+"""Delays tried per frame period."""
 LEAST_BRIGHTNESS_SDS = 6.0
 """Standard deviations by which light must be brighter than dark to count as light."""
 MOST_SWEEPS = 20
@@ -67,8 +67,8 @@ MOST_SWEEPS = 20
 class GateDelay:
     """Delay of the light relative to the planned gate, in seconds.
 
-    opens_s, closes_s: how much later than planned the light comes and goes; NaN if the line was not in the picture
-    then. opens_sd_s, closes_sd_s: their standard deviations. edges: number of edges seen.
+    opens_s, closes_s: how much later than planned the light comes and goes; NaN if that was not seen. opens_sd_s,
+    closes_sd_s: their standard deviations. edges: number of edges used.
     """
 
     opens_s: float
@@ -79,12 +79,12 @@ class GateDelay:
 
     @property
     def delay_s(self) -> float:
-        """Mean of both delays; NaN if one was not seen."""
+        """Mean of the delays of opening and closing; NaN if one of them was not seen."""
         return (self.opens_s + self.closes_s) / 2
 
     @property
     def sd_s(self) -> float:
-        """Standard deviation of the mean; NaN if one was not seen."""
+        """Standard deviation of `delay_s`; NaN if one of the two was not seen."""
         return math.hypot(self.opens_sd_s, self.closes_sd_s) / 2
 
 
@@ -97,8 +97,8 @@ def calibrate_sync(
 ) -> CalibrationResult:
     """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`).
 
-    The lags are put into a copy of the model, if there is one. Raises Degenerate if they cannot be determined,
-    CalibrationError for a model that cannot be used, UsageError for a wrong request.
+    The lags are put into a copy of the request's calibration, or else of the rig's own, if there is one. Raises
+    Degenerate if they cannot be determined, CalibrationError for a bad calibration, UsageError for a wrong request.
     """
     request = replace(request or SyncRequest(), **changes)
     values = si_values(request)
@@ -129,7 +129,7 @@ def calibrate_sync(
 
 
 def _scanned(live: RigConfig, request: SyncRequest, session: Session) -> GateDelay | None:
-    """Scan at every speed; the gate's delay comes from the fastest sweeps, which are recorded for it."""
+    """Scan at every speed. The gate's delay is measured in the fastest scan, which is recorded for that."""
     speeds = request.exposures or speeds_of(live)
     gate = None
     with TemporaryDirectory() as scratch:
@@ -153,7 +153,7 @@ def _own(live: RigConfig | None) -> LoadedCalibration | None:
 
 
 def _signed(model: RigModel, gate: GateDelay | None, verdict: Verdict) -> RigModel:
-    """The model with the gate's delay and the origin of the lags; its verdict fails if that of the lags did."""
+    """The model with the gate's delay and the provenance of the lags. It gets the verdict 'failed' if they do."""
     identity = model.identity
     if identity is not None and not verdict.passed:
         identity = replace(identity, verdict="failed", reasons=(*identity.reasons, *verdict.codes))
@@ -206,7 +206,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run; None without markers, since the light itself then gives the time."""
+    """Measure the gate's delay in a recorded run; None without markers, as planned times then follow from the light."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None
@@ -225,8 +225,8 @@ def gate_delay(run: Path) -> GateDelay | None:
 
 
 def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises: bool) -> Edge | None:
-    """Fit an edge at each of the delays late_s; None for too few frames around it. ones: from `_ones`. middle_s:
-    (frames,), middles of the exposures after the planned time of the edge.
+    """Fit an edge at each of the delays late_s; None with too few frames around it. ones: from `_ones`. middle_s:
+    (frames,), the exposures' middles in seconds after the planned time of the edge. rises: whether light begins there.
     """
     frame_s = float(1 / plan.frame_rate_hz)
     near = np.abs(middle_s) < AROUND_FRAMES * frame_s
@@ -239,7 +239,7 @@ def _edge(ones: Array, middle_s: Array, late_s: Array, plan: ScanPlan, *, rises:
 
 
 def _saturation(lit: Array, dark: Array) -> float:
-    """Sum of p^2 divided by sum of p, with p the chance that the line makes a pixel fire; 1, the worst, if unknown."""
+    """Sum of p^2 over sum of p, with p each pixel's chance to fire for the line; 1, the worst, if it is unknown."""
     if not (len(lit) and len(dark)):
         return 1.0
     whole, next_one, after = (lit.mean(axis=0) - dark.mean(axis=0)).tolist()
@@ -247,8 +247,8 @@ def _saturation(lit: Array, dark: Array) -> float:
 
 
 def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
-    """For each of the first sweeps: its number, `_ones` (frames, 3) and the times (frames,) of the exposures' middles
-    in seconds after the scan marker."""
+    """For each of the first MOST_SWEEPS sweeps: its number, `_ones` (frames, 3), and the middles of its exposures in
+    seconds after the scan marker, (frames,)."""
     recording = RunRecording(run)
     found: list[tuple[int, Array, Array]] = []
     for start in recording.runs:
@@ -271,7 +271,7 @@ def _sweeps(run: Path, plan: ScanPlan) -> list[tuple[int, Array, Array]]:
 def _ones(block: FrameBlock) -> Array:
     """Numbers (frames, 3) of pixels that fired in a frame, in it and the next one, in it and the next but one.
 
-    NaN without such a frame, and if the window has moved by then."""
+    NaN where the block has no such later frame, or the window has moved in between."""
     bits, x0 = block.bits, block.records["x0"]
     ones = np.full((len(bits), 3), np.nan)
     for apart in range(3):
@@ -283,7 +283,7 @@ def _ones(block: FrameBlock) -> Array:
 
 
 def _after_marker(column: Array, plan: ScanPlan, sweep: int) -> Array:
-    """Time after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
+    """Seconds after the scan marker at which the mirror was due at fractional columns; undoes `ScanPlan.column`."""
     leg = plan.leg(sweep)
     done = column + 0.5 if leg.columns_rise else plan.places - 0.5 - column
     return plan.lit_start_s(leg) + done * float(plan.column_s)

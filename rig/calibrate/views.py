@@ -33,10 +33,10 @@ from rig.progress import part, tell_stage
 from rig.requests import BoardRequest
 
 MISSED_SHARE = 0.5
-"""Most extra poses, relative to those requested, that are shown if the board is not found at some."""
+"""Most extra poses, as a share of those requested, that are shown if some give no good view."""
 
 LASTING = (["wrong-board"] * 3, ["mirrored"] * 3)
-"""A session ends if the first views are refused for these reasons, since no other pose of the board would help."""
+"""A session ends if these are the reasons against its first views, since no other pose of the board would help."""
 
 
 ChoosePose = Callable[[Sequence[View]], Advice | None]
@@ -44,7 +44,7 @@ ChoosePose = Callable[[Sequence[View]], Advice | None]
 
 
 def require_poses(session: Session, poses: int) -> None:
-    """Raise UsageError if this number of poses, with the views taken already, is below FEWEST_POSES."""
+    """Raise UsageError if this number of poses, with the views of a board taken already, is below FEWEST_POSES."""
     there = sum(view.corners is not None for view in session.views)
     if there + poses < FEWEST_POSES:
         beside = f" and {there} view{'s' * (there > 1)} taken before" if there else ""
@@ -56,7 +56,7 @@ def require_poses(session: Session, poses: int) -> None:
 def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: int, behind: int = 0) -> ChoosePose:
     """Return a function that chooses the poses of `calibration.guide.sequence` in order, with some to spare.
 
-    behind: number of poses of the sequence already shown. Raises UsageError if no pose fits the picture.
+    behind: number of poses to skip at the beginning. Raises UsageError if no pose fits the picture.
     """
     choices = candidates(first_camera(config), board, config.scan.depth_range)
     if not choices:
@@ -67,7 +67,7 @@ def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: i
 
 
 def first_camera(config: RigConfig) -> Camera:
-    """A camera for placing boards: that of the config's calibration, or a rough one of the sensor's size."""
+    """A camera for placing boards: that of the config's calibration or, if it has no usable one, a rough one."""
     if config.calibration is not None:
         try:
             return load_rig_model(config.calibration).camera
@@ -88,12 +88,12 @@ def take_live(
     defects: NDArray[np.bool_] | None = None,
     line: bool = True,
 ) -> None:
-    """Take as many good views as are requested, of a board that is moved from pose to pose.
+    """Take views of a board moved from pose to pose, until as many as requested are good, or more would not help.
 
     choose: chooses the poses. ask: asks a person to move the board.
     exposures: per column, used in turn, so that the mirror is seen at several speeds (see `SpeedRotation`); empty: the
       config's.
-    defects: (rows, width), pixels that are not used. line: whether the line has to be seen on the board.
+    defects: (rows, width), pixels that are not used. line: whether a good view has to show the line on the board.
     """
 
     def sees(capture: Capture) -> bool:
@@ -137,7 +137,7 @@ def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_]
 
 
 def _require_alike(folder: Path, board: Board | None) -> None:
-    """Raise UsageError if a session shows another board. The squares' size may differ: it can be measured again."""
+    """Raise UsageError if a session shows another board, or any where none is expected. Squares may differ in size."""
     file = folder / BOARD_FILE
     if not file.is_file():  # no board was looked for
         return
@@ -160,7 +160,7 @@ def _print(board: Board) -> str:
 
 
 def _pictured(file: Path, board: Board | None) -> tuple[View, Degenerate | None]:
-    """Read a picture of the board, taken with any camera, as a view."""
+    """A picture of the board as a view, and why it has no corners (None if it has). Raises UsageError if unreadable."""
     pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise UsageError(f"{file} cannot be read as a picture; convert it to PNG")
@@ -191,6 +191,6 @@ def refusal(
 
 
 def note_views(error: Degenerate, session: Session) -> None:
-    """Add the problems of single views as notes, unless they were reported when the views were taken."""
+    """Add the problems of single views as notes, unless the session has told them as the views came."""
     for name, why in session.refused.items() if session.tell is None else ():
         error.add_note(f"view {name}: {why}")

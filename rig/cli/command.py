@@ -121,7 +121,8 @@ def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:
-    """Split an option that may be given several times and with commas. Raises UsageError if no value is left."""
+    """Split an option that may be given several times and with commas. Empty if it is not given; raises UsageError if
+    only empty values are given."""
     parts = (part.strip() for value in given or () for part in value.split(","))
     named = list(dict.fromkeys(part for part in parts if part))
     if given and not named:
@@ -130,7 +131,7 @@ def split_option(option: str, given: list[str] | None) -> list[str]:
 
 
 def whole_numbers(option: str, given: list[str] | None) -> list[int]:
-    """Split an option as `split_option` does, into whole numbers. Raises UsageError for anything else."""
+    """Split an option as `split_option` does, into whole numbers of 0 or more. Raises UsageError for anything else."""
     parts = split_option(option, given)
     wrong = [part for part in parts if not part.isdecimal()]
     if wrong:
@@ -238,7 +239,7 @@ def _code_of(error: Exception) -> int | None:
 
 
 def report(result: "RunResult") -> Answer:
-    """The answer of a command that made a run: its summary, and the exit code of its verdict."""
+    """The answer of a command that made a run: summary, and exit code of the verdict. Warns if no pixel has a depth."""
     from rig.run_folder.summary import RunVerdict
 
     if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:

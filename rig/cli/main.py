@@ -131,7 +131,7 @@ def _values(option: str, arguments: list[str]) -> list[str]:
 
 
 def _require_no_empty(arguments: list[str]) -> None:
-    """Raise BadParameter for an empty argument or `--NAME=`, mostly an unset shell variable. As a path it means '.'."""
+    """Raise BadParameter for an empty argument or `--NAME=`, mostly an unset shell variable. "" as a path means '.'."""
     for before, word in pairwise(["rig", *arguments]):
         if not word or (word.startswith("--") and word.endswith("=")):
             place = f"the argument behind '{before}'" if not word else f"'{word}'"

@@ -23,14 +23,14 @@ class Bundled:
 
 
 def bundled_rigs() -> tuple[Bundled, ...]:
-    """The rigs that a command takes by name as CONFIG, sorted."""
+    """The rigs that commands take by name as CONFIG, sorted by name."""
     # Boards and calibrations lie in the same folder.
     is_rig = re.compile(r"^scan:", re.MULTILINE).search
     return tuple(_bundled(path) for path in _by_name(BUNDLED) if is_rig(path.read_text(encoding="utf-8")))
 
 
 def bundled_scenes() -> tuple[Bundled, ...]:
-    """The scenes that simulated rigs take by name as --scene, sorted."""
+    """The scenes that simulated rigs take by name as --scene, sorted by name."""
     return tuple(_bundled(path) for path in _by_name(SCENES))
 
 

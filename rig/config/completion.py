@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import yaml
 
 MOST_COLUMNS = 110
-"""Characters of a line. Keys that are filled in within braces continue on the next line if they would exceed this."""
+"""Longest line, in characters, of keys added within braces; what would exceed it goes to the next line."""
 
 
 class _Edit(NamedTuple):
@@ -18,7 +18,7 @@ class _Edit(NamedTuple):
 
 
 def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> str:
-    """Edit a text: replace strings that differ in `values`, and add the keys of `full` that are missing.
+    """The text after two changes: strings that differ in `values` are replaced, missing keys of `full` are added.
 
     node: parsed node of the text. values: content of the text, in which strings may have been changed. full: content
     with all keys.
@@ -31,7 +31,7 @@ def completed(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full
 
 
 def _edits(text: str, node: yaml.MappingNode, values: Mapping[str, Any], full: Mapping[str, Any]) -> Iterator[_Edit]:
-    """Replacements for the text. If several begin at one place, the one of the inner mapping comes first."""
+    """Replacements for the text. Of several that begin at one place, that of the inner mapping comes first."""
     for key, value in node.value:
         given = values.get(key.value)
         if isinstance(value, yaml.MappingNode) and isinstance(given, Mapping):
@@ -71,7 +71,7 @@ def _added_below(text: str, node: yaml.MappingNode, missing: Mapping[str, Any]) 
 
 
 def _end(node: yaml.Node) -> int:
-    """Index after the last character of a node's content. The end mark of a node without brackets may lie beyond it."""
+    """Index after a node's content. The end mark of a mapping or list without brackets may lie farther on."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
@@ -79,7 +79,7 @@ def _end(node: yaml.Node) -> int:
 
 
 def block_text(content: Mapping[str, Any], indent: str = "") -> str:
-    """The text of keys and values, each on its own line."""
+    """Keys and values as YAML, one line each; those of inner mappings are indented below."""
     lines = []
     for key, value in content.items():
         if isinstance(value, Mapping) and value:
@@ -90,6 +90,6 @@ def block_text(content: Mapping[str, Any], indent: str = "") -> str:
 
 
 def _flow(content: dict[str, Any] | list[Any]) -> str:
-    """A mapping or a list on one line, without its brackets."""
+    """A mapping or a list as YAML on one line, without its brackets."""
     text: str = yaml.safe_dump(content, sort_keys=False, default_flow_style=True, allow_unicode=True, width=10**9)
     return text.strip()[1:-1]

@@ -37,7 +37,7 @@ FLAGS: Mapping[Key, str] = {
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
-    """The config model of the kind that a slot's content names; None if slot or kind is missing or unknown."""
+    """The config model of the kind that the section of a slot (device or world) names; None if either is unknown."""
     if slot not in SLOTS or not isinstance(content, Mapping):
         return None
     try:
@@ -87,7 +87,7 @@ def load_config(name_or_path: str | Path = "simulated", overrides: Mapping[str, 
 
 
 def load_cube_plan(path: str | Path) -> CubePlan:
-    """Load the `plan.yaml` of frames alone (`rig reconstruct`). Raises UsageError with one line per problem."""
+    """Load the `plan.yaml` of a bare cube of frames (`rig reconstruct`). Raises UsageError, with a line per problem."""
     read = _read(Path(path), "a plan", "columns: 500")
     keys = f"the plan of frames alone has {', '.join(CubePlan.model_fields)}"
     if {"spad", "scanner"} <= read.content.keys():
@@ -164,7 +164,7 @@ def bundled_configs() -> tuple[str, ...]:
 
 
 def find_config(name_or_path: str | Path) -> Path:
-    """Find the file that a name or path means. Raises UsageError if there is none."""
+    """Find the file that a bundled name or a path means. Raises UsageError if there is none."""
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path
@@ -186,7 +186,7 @@ def find_config(name_or_path: str | Path) -> Path:
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of a rig config, with the installed kinds of every slot."""
+    """JSON schema of a rig config, with the installed kinds for the world and each device."""
     schema = RigConfig.model_json_schema()
     definitions = schema.setdefault("$defs", {})
     definitions.pop("KindConfig", None)
@@ -232,7 +232,7 @@ def _validated(
 
 
 def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
-    """Make relative paths in the sections of devices absolute, since devices do not know the file's folder.
+    """Make relative paths in the sections of devices and world absolute, since these do not know the file's folder.
 
     These count as paths: a scene that is not bundled, a value whose field is a path, and text that begins with ./ or
     ../, ends in .yaml or .yml, or has a slash and exists in the folder. Text that begins with ~ is left as it is.
@@ -258,8 +258,8 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
 
 
 def _absolute(path: Path) -> str:
-    """Make a path absolute. Links and '..' in its folder are resolved. A last part that is a link is kept, since names
-    in /dev/serial/by-id/ are stable."""
+    """Make a path absolute. Links and '..' in its folder are resolved. Its last part is kept even if it is a link:
+    names in /dev/serial/by-id/ are stable."""
     return str(path.parent.resolve() / path.name)
 
 

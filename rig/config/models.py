@@ -32,8 +32,9 @@ from drivers.registry import KindConfig, kinds, lookup
 from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
 
 MOST_LINES = 16
+MOST_THREADS = 256
 LEAST_FRESH = 0.5
-"""Least distance of neighbouring lines, as a share of the mirror's sweep: closer ones light most places twice."""
+"""Least distance of neighbouring lines, as a share of the mirror's sweep: closer lines light most places twice."""
 
 LinePower = Literal["shared", "each"]
 
@@ -60,7 +61,7 @@ LineOffsets = Annotated[
 
 
 MIN_DARK_FRACTION = 0.05
-"""Smallest share of a sweep's frames that must be dark, since the dark rate is learned from them. Cubes need none."""
+"""Smallest share of a sweep's frames that must be dark: the dark rate is learned from them. A `CubePlan` has none."""
 
 AUTO: Final = "auto"
 """Setting that chooses the estimator: `joint` where it keeps up with the frames, else `likelihood`."""
@@ -183,7 +184,7 @@ class EstimateConfig(ConfigSection):
     threads: int | None = Field(
         default=None,
         ge=1,
-        le=256,
+        le=MOST_THREADS,
         description="threads that count and estimate, null for one a core; results do not depend on it",
         examples=[2],
     )
@@ -200,7 +201,7 @@ class EstimateConfig(ConfigSection):
 
 
 def _of_slot(slot: str) -> BeforeValidator:
-    """A validator for a device's section. It turns a mapping or config model into the model of the kind it names."""
+    """A validator for the section of a device or world: makes it the config model of the kind that it names."""
 
     def validate(value: object, info: ValidationInfo) -> object:
         if isinstance(value, KindConfig):
@@ -255,7 +256,7 @@ class RigConfig(ConfigSection):
 
 
 class CubePlan(ConfigSection):
-    """`plan.yaml` of `rig reconstruct`: how frames from another program were taken."""
+    """`plan.yaml` of `rig reconstruct`: how a bare cube of frames, without markers, was taken."""
 
     columns: Columns
     exposures: Exposures
@@ -264,7 +265,7 @@ class CubePlan(ConfigSection):
 
 
 def line_problems(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> list[str]:
-    """Problems with scanning this number of columns with these lines while the mirror sweeps `command_range`."""
+    """Problems with scanning `columns` columns with lines at `offsets` while the mirror sweeps `command_range`."""
     lines = len(offsets)
     problems = []
     if columns % lines:

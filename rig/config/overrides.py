@@ -12,7 +12,7 @@ PathLike = str | os.PathLike[str]
 Config = RigConfig | PathLike
 
 SIMULATED = "simulated"
-"""Name of the bundled rig, and kind of the devices, that need no hardware."""
+"""Name of the bundled rig, and of the kinds of its devices, which need no hardware."""
 MAX_SEED = 2**63 - 1
 """Largest seed: the largest number that other programs read from the manifest as an integer."""
 
@@ -29,7 +29,7 @@ def configure(
     temporal_prior: bool | None = None,
     learned: PathLike | None = None,
 ) -> RigConfig:
-    """Load and validate the config that `scan` would use. An option that is None leaves the config's value.
+    """Load and validate a config, changed by options. An option that is None leaves the config's value.
 
     config: the name of a bundled rig, a file or a RigConfig.
     scene: for a simulated rig: the name of a bundled scene, or a path.
@@ -80,8 +80,8 @@ def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
 def with_lines(config: RigConfig, lines: int, power: LinePower = "shared") -> RigConfig:
     """Make a config with `lines` evenly spaced lines over the same field. The mirror sweeps only the share of one line.
 
-    config: a rig with one line. Columns are rounded down to a multiple of `lines`, at least `lines`. Raises UsageError
-    for a config with several lines, for a number of lines out of range, and if the changed config is not valid.
+    config: a rig with one line. Columns are rounded down to a multiple of `lines`, but to no less than `lines`. Raises
+    UsageError for a config with several lines, a number of lines out of range, and if the changed config is not valid.
     """
     if len(config.line_offsets) > 1:
         raise UsageError(f"{config.name} has {len(config.line_offsets)} lines already; name a config with one")

@@ -7,7 +7,7 @@ waveform that marker lies. The number of points since then is the time since the
 point rate, times the ratio of the scanner's clock to the SPAD's. The ratio is fitted to the markers of every sweep and
 used in the next one. So the column of a frame depends only on earlier frames, not on the size of blocks (unless a
 record is damaged). A compiled walk (`rig.count.bind_kernels`) places the frames; Python runs only once per block and at
-the begin of each sweep.
+the beginning of each sweep.
 
 The lit frames of a sweep go through the columns in order. When a new marker corrects the time extrapolated from the
 marker before, frames may fall back to a column already left. Such frames are not used.
@@ -37,7 +37,7 @@ Places = tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]
 """Sweep, column and bin of each frame."""
 UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Units of time in a tick. In whole units (int64) markers and middles of exposures are exact, so that a frame's column
-is the same to the last bit in whatever block it comes. They suffice for 200 days at 1 GHz."""
+is the same to the last bit in whatever block it comes. int64 suffices for 200 days at 1 GHz."""
 CARRIED = np.dtype(
     [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
 )
@@ -53,9 +53,10 @@ column, in_column: the column that the sweep has come to, -1 before the first, a
 class BoundFrames:
     """Sweep, column and bin of each frame of a block.
 
-    sweep: -1 before the first marker. column: fractional, at the middle of the exposure, continued linearly outside the
-    lit part; NaN before the first usable marker and for frames that name a sweep out of turn. bins: column index,
-    BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and those at which a sweep begins.
+    sweep: -1 before the first marker; a damaged record may name an earlier one. column: fractional, at the middle of
+    the exposure, continued linearly outside the lit part; NaN before the first usable marker and for frames that name a
+    sweep out of turn. bins: column index, BIN_DARK or BIN_UNUSABLE. starts: frame indices: 0, and those at which a
+    sweep begins. With several lines, columns are places of the mirror.
     """
 
     sweep: NDArray[np.int32]
@@ -88,7 +89,7 @@ class SweepClock:
 
     @property
     def synchronised(self) -> bool:
-        """Whether the columns of this sweep's frames can be trusted."""
+        """Whether the columns of this sweep's frames can be trusted; False if residual_columns is NaN."""
         return (
             self.residual_columns <= MAX_RESIDUAL_COLUMNS
             and abs(self.clock_error) <= MAX_CLOCK_ERROR
@@ -113,7 +114,8 @@ class PlanTerms(NamedTuple):
 
 class BlockTerms(NamedTuple):
     """Numbers of a block's header for the walk. sweep: scan markers up to the block's first frame. start_ticks: from
-    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure (`UNITS_PER_TICK`)."""
+    the first block's start to this one's. period_ticks: of a frame. middle: half an exposure in units, see
+    `UNITS_PER_TICK`. points_per_unit: points of the scanner, by the clock ratio so far."""
 
     sweep: int
     start_ticks: int
@@ -164,8 +166,7 @@ class FrameBinder:
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Sweep, column and bin of the block's frames, and the clocks of the sweeps that the block closes. Raises
-        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does.
-        """
+        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does."""
         header, n = block.header, block.n_frames
         if self._t0 is None:
             self._t0 = header.t0_ticks
@@ -214,8 +215,8 @@ class FrameBinder:
         """Whether frame `at` names a sweep that cannot have begun, for example because a bit is flipped.
 
         The next sweep is confirmed by a scan marker in the frame itself. Otherwise the following frame must name the
-        same sweep. If sweeps are skipped, or the block has no following frame, enough time must have passed since the
-        latest marker. Before the first sweep, the last of several frames needs a scan marker.
+        same sweep, or begin the one after. If sweeps are skipped, or the block has no following frame, enough time must
+        have passed since the latest marker. Before the first sweep, the last of several frames needs a scan marker.
         """
         now = self._carried[0]
         running, number = int(now["sweep"]), _sweep_named(records[at], terms)
@@ -298,7 +299,7 @@ class FrameBinder:
         return closed
 
     def _boundary_frame(self, number: int, at: int, header: BlockHeader, start: int) -> int:
-        """Number of the frame in which sweep `number` began if its marker was lost, computed from the clocks."""
+        """Number of the frame in which sweep `number` must have begun according to the clocks; its marker was lost."""
         here = header.first_frame + at
         time, point = (int(self._carried[name][0]) for name in ("anchor_time", "anchor_point"))
         if point < 0:
@@ -336,7 +337,7 @@ def _new_places(n: int) -> Places:
 
 
 def _sweep_named(record: np.void, terms: BlockTerms) -> int:
-    """Number of the sweep that a frame names: the scan markers so far, which its record has mod 2^16, minus 1."""
+    """Number of the sweep that a frame names: the scan markers so far, of which its record has 16 bits, minus 1."""
     return terms.sweep + ((int(record["sweep"]) - terms.sweep) & 0xFFFF) - 1
 
 

@@ -74,7 +74,7 @@ def walk(
     column: NDArray[np.float64],
     bins: NDArray[np.int32],
 ) -> Any:
-    """Place frames from index `at` on; returns the index of the first frame of a new sweep, or the number of records.
+    """Place frames from index `at` on. Returns the index of the first that names a later sweep, or len(records).
 
     carried: (1,) of `CARRIED`. edges: (2, enough) point and time of the present sweep's markers. The other arrays are
     filled as in `BoundFrames`.

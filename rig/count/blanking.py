@@ -49,7 +49,7 @@ PHASES = np.arange(4) / 4
 """Places tried within each frame by the rough search, in frames."""
 _FIT_STEPS = 4
 _NO_LIGHT = 1e-300
-"""Ones per frame, fewer than any light gives. They make scores 0 instead of 0/0 in frames without a single one."""
+"""Ones per frame, fewer than any light gives. They make scores 0 instead of 0/0 in frames without any ones."""
 _GRAIN = 64
 """The rough search rounds shares of a frame to multiples of 1/64, so that its sums are exact in any order."""
 
@@ -57,8 +57,7 @@ _GRAIN = 64
 @dataclass(frozen=True, slots=True)
 class PatternFit:
     """A fitted pattern. place: its first edge, in frames; sd: the place's standard deviation. score: see the module.
-    level: ones of a frame without the pattern's light. brightness: extra ones of a lit frame.
-    """
+    level: ones of a frame without the pattern's light. brightness: extra ones of a lit frame."""
 
     place: float
     sd: float
@@ -69,9 +68,7 @@ class PatternFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatternShape:
-    """A blanking pattern. flashes: (m, 2) open and close of each, in frames from the first edge. exposure: share of a
-    frame's period.
-    """
+    """A blanking pattern. flashes: (m, 2), open and close in frames from the first edge. exposure: in frame periods."""
 
     flashes: Array
     exposure: float
@@ -125,7 +122,8 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing. Returns None also if too many frames are missing.
+        ones: of frames `first`, first + 1, ... , NaN if missing. Returns None also if frames of `span` lie outside, or
+        too many are missing.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -148,7 +146,8 @@ class PatternSearch:
 
 
 def _judged(cross: Array, left: float, total: Array, mean: Array, n: int) -> tuple[Array, Array]:
-    """(score, excess). excess: the residual beyond photon noise, divided by what the pattern explains."""
+    """(score, excess). excess: the residual beyond photon noise, divided by what the pattern explains. Sums without
+    level and drift: left, of squared shares; cross, of shares times ones; total, of squared ones. mean: of the ones."""
     explained = cross**2 / left
     rest = np.maximum(total - explained, 0)
     scatter = np.maximum(rest / (n - 4), np.maximum(mean, _NO_LIGHT))
@@ -191,9 +190,7 @@ LEAST_SD_FRAMES = 1e-3
 
 @dataclass(slots=True)
 class MarkerLine:
-    """Scan markers found so far: the index of each one's sweep, its place in frames, and the place's standard
-    deviation.
-    """
+    """Scan markers found so far: index of each one's sweep, its place in frames, standard deviation of the place."""
 
     index: list[int] = field(default_factory=list)
     place: list[float] = field(default_factory=list)
@@ -294,7 +291,7 @@ class BlankingSync:
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
         """Fill marks, line and sweep of the block's `records` (n,).
 
-        Raises DeviceFault if frames end, or the search (`SEARCH_S`), without two patterns that are one sweep apart.
+        Raises DeviceFault if the frames or the time (`SEARCH_S`) end before two patterns one sweep apart are found.
         """
         header, n = block.header, block.n_frames
         self._count(block)
@@ -427,7 +424,7 @@ class BlankingSync:
         leg = self._plan.leg(now.number)
         since = first + np.arange(len(records)) - now.scan_frame
         opened, closed = leg.gate_open_s * self._rate, leg.gate_close_s * self._rate
-        # The gate follows the sync source's clock, which light does not show: margin is half a frame and its error.
+        # The gate follows the sync source's clock, unknown here: hence a margin of half a frame plus its largest error.
         early, late = (0.5 + MAX_CLOCK_ERROR * at for at in (opened, closed))
         upcoming = self._period / now.ratio + self._delay[(now.number + 1) % len(self._delay)] - self._tolerance
         marks = np.full(len(records), int(Mark.GATE_EDGE), np.uint32)

@@ -56,14 +56,14 @@ def planes_for(frames: int) -> int:
 
 @numba.njit(inline="always")
 def _sum_3(a, b, c):  # type: ignore[no-untyped-def]
-    """Ones and twos of three bits."""
+    """Binary digits (ones, twos) of the sum of three bits."""
     u = a ^ b
     return u ^ c, (a & b) | (u & c)
 
 
 @numba.njit(inline="always")
 def _sum_5(a, b, c, d, e):  # type: ignore[no-untyped-def]
-    """Ones, twos and fours of five bits."""
+    """Binary digits (ones, twos, fours) of the sum of five bits."""
     ones, t = _sum_3(a, b, c)
     ones, v = _sum_3(ones, d, e)
     return ones, t ^ v, t & v
@@ -71,7 +71,7 @@ def _sum_5(a, b, c, d, e):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _sum_7(a, b, c, d, e, g, h):  # type: ignore[no-untyped-def]
-    """Ones, twos and fours of seven bits."""
+    """Binary digits (ones, twos, fours) of the sum of seven bits."""
     ones, t = _sum_3(a, b, c)
     ones, v = _sum_3(ones, d, e)
     ones, w = _sum_3(ones, g, h)
@@ -81,7 +81,7 @@ def _sum_7(a, b, c, d, e, g, h):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def _add_number(p, i, ones, twos, fours, few):  # type: ignore[no-untyped-def]
-    """Add a 3-bit number to the first four planes; the overflow goes to the last plane, unless `few` is set."""
+    """Add a 3-bit number to the first four planes; the overflow goes to the scratch plane, unless `few` is set."""
     x = p[i]
     p[i] = x ^ ones
     p[CHUNK + i], carry = _sum_3(p[CHUNK + i], twos, x & ones)
@@ -156,7 +156,7 @@ def _set_first(words, at, frame, n, frames, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _carry_on(n, p):  # type: ignore[no-untyped-def]
-    """Add what overflowed the first four planes to the others."""
+    """Add what overflowed the first four planes (the scratch plane) to the others."""
     for i in range(n):
         carry = p[PLANES * CHUNK + i]
         for q in range(4, PLANES):

@@ -1,8 +1,8 @@
 """Counts of a row in lane order: the order in which shifts and masks alone turn bit planes into bytes.
 
-Lane i of pair q holds the bytes of pixels 8 i + 2 q and 8 i + 2 q + 1, in the order of bits in packed bytes. A row of
-counts is uint8 (PAIRS, lanes + 2 PAD, 2). PAD zero lanes on both sides of each pair's lanes allow a load at any offset
-of up to PAD lanes. An x86 processor multiplies and adds two neighbouring counts in one instruction.
+Lane i has the pixels of byte i of the packed bits, 8 i to 8 i + 7, in PAIRS pairs: pair q holds the counts of pixels
+8 i + 2 q and 8 i + 2 q + 1. A row of counts is uint8 (PAIRS, lanes + 2 PAD, 2). PAD zero lanes on both sides of each
+pair's lanes allow a load at any offset of up to PAD lanes. An x86 processor multiplies and adds a pair in one step.
 """
 
 from typing import Final
@@ -16,9 +16,9 @@ from rig.simd.shuffles import first_row_pairs, second_row_pairs
 from rig.simd.vectors import LANES, as_bytes, zero_bytes, zero_int16
 
 STEPS: Final = 8
-"""Pixels per lane."""
+"""Pixels per lane. Step s of a lane is its pixel s."""
 PAIRS: Final = 4
-"""Pairs of pixels per lane."""
+"""Pairs of neighbouring pixels per lane."""
 PAD: Final = 8
 """Zero lanes before and after the lanes of each pair."""
 
@@ -153,9 +153,7 @@ def write_counts(n: NDArray[np.uint8], counts: NDArray[np.unsignedinteger]) -> N
 
 @numba.njit(cache=True, nogil=True)
 def halve_counts(n: int, lanes: int, times: int) -> None:
-    """Divide all counts of the row at address n by 2^times. Rounding alternates between up and down, so that small
-    counts keep their mean.
-    """
+    """Divide the counts of the row at address n by 2^times, rounded up or down so that small counts keep their mean."""
     rest = (1 << times) - 1
     for q in range(PAIRS):
         # A byte plus its share may overflow, so the remainder of the division is rounded separately.

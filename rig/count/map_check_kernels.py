@@ -8,10 +8,10 @@ n ones of a pixel in K frames and r its usual rate, line k becomes stripe-like e
 
 The light in common with a partner at pixel distance s is the sum over j of e_0(j) times (the sum of e_k from
 j + s - LAGS_PX to j + s + LAGS_PX, minus the mean of the same sum BESIDE_PX to either side). Smoothness is the sum of
-products of neighbouring pixels. Lines are int32 (line and partners, points, window); results of `compare_lines` are
+products of neighbouring pixels. Lines are int32 (own and partners', points, window); results of `compare_lines` are
 float64 (points, 3 + orders).
 
-Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z, at offsets o in bins:
+Broad light, mainly haze, is compared by sums of z over BIN_PX, minus the line's mean of z. With s and o in bins:
 
     a_k(i) = sum over bin i of (z - mean of z),    shared(partner, o) = sum over points and i of a_0(i) a_k(i + s + o)
 """
@@ -34,8 +34,8 @@ LAGS_PX: Final = 2
 BESIDE_PX: Final = 9
 """Distance from the expected place, in pixels, at which light still in common is haze."""
 LEAST_SHARED: Final = 0.25
-"""Least light that the frames of one column have in common, relative to that of two rows. It is 1 for a laser line that
-stands still, and 0.4 at two frames per column for one that moves by 5 px during the column."""
+"""Least light that the frames of one column have in common, relative to that of two rows. A laser line that stands
+still has 1; one that moves by 5 px during the column has 0.4 with two frames per column."""
 
 
 @numba.njit(inline="always")

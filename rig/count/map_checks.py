@@ -1,4 +1,4 @@
-"""Checks of a map's counts and answers by its own light. A correctly taken map passes them, whatever the scene.
+"""Checks of a map's counts and answers by its own light. A correctly taken map should pass them, whatever the scene.
 
 They use up to 8192 points, or 512 if not all counts are kept. A point is a row and a column. Its partners are the next
 row in the same column, and the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in
@@ -12,11 +12,11 @@ Point and partners each have a line of counts: those of the row in the column.
   haze.
 - Answers of estimators that learn the light: an answer with confidence 0.9, for one place of some 150, needs evidence
   of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on
-  average, which is light half a standard deviation above the background. So there must be that much more light at the
-  answers than behind them, on lines of counts that did not give the answers; or, in dense fog, where more lines
-  contribute, at least 0.4 of the light that the estimator says it has found.
+  average, which is light half a standard deviation above the background. That much more light must be at the answers
+  than behind them, on lines of counts that did not give the answers; or, in dense fog, where more lines contribute, at
+  least 0.4 of the light that the estimator says it has found.
 
-Limits are in standard deviations estimated from the points themselves. With too few points, a check says nothing.
+Standard deviations are estimated from the points themselves. With too few points, a check says nothing.
 """
 
 from collections.abc import Iterator
@@ -32,9 +32,9 @@ from rig.geometry.windows import WORD_PX, SweepGeometry, evenly_spread
 Array = NDArray[np.float64]
 
 POINTS: Final = 512
-"""Most points of a sweep whose counts are not kept, except the lines of counts of these points."""
+"""Most points if only their and their partners' lines of counts are kept."""
 VOLUME_POINTS: Final = 8192
-"""Most points of a sweep whose counts are kept."""
+"""Most points if all counts of the sweep are kept."""
 FEWEST_POINTS: Final = 128
 """Least number of points for a check."""
 APART_PX: Final = (6.0, 16.0, 32.0, 64.0)
@@ -51,12 +51,11 @@ FEWEST_ROWS: Final = 24
 """Least number of rows for the check of pixel order: a sum over n rows reaches sqrt(n) standard deviations at most."""
 LEAST_FOLLOWING: Final = 0.25
 """Least light in common with the nearest partner column, relative to that with the next row. Scenes have 0.8 and more,
-clutter such as fences half of it. Columns that do not follow one another have none."""
+clutter such as fences half of that. Columns that do not follow one another have none."""
 MOST_AMISS: Final = -0.45
-"""Limit of a sum over the four partner columns: light in common at the best wrong place, minus that at the best place
-where the planes put it, relative to the light in common with the next row. Maps have -0.65 in dense fog to -3 in clear
-air; shuffled or reversed columns have -0.4 to 2.
-"""
+"""Limit of a sum over the four partner columns: light in common at the best wrong place, minus that at the best of the
+places that the planes predict, relative to the light in common with the next row. Maps have -0.65 in dense fog to -3 in
+clear air; shuffled or reversed columns have -0.4 to 2."""
 LEAST_LIGHT: Final = 12.0
 """Least light in common with the next row, in standard deviations, to judge how light moves."""
 MARGIN: Final = 3.5
@@ -72,14 +71,14 @@ SURE: Final = 0.9
 GROUPS: Final = 16
 """Most groups of sure answers, by distance. Wrong answers mostly form a false surface, so they are in one group."""
 LEAST_CONTRAST: Final = 0.5
-"""Least mean light at sure answers above that behind them, in standard deviations: see the module."""
+"""Least mean light at sure answers above that behind them, in standard deviations of one answer; see the module."""
 LEAST_SHARE: Final = 0.4
-"""Share of the signal of dim answers that must be there. Right ones in dense fog at K = 3 have 0.43 to 0.92 of it."""
+"""Share of dim answers' signal that must be there. Right ones have 0.43 to 0.92 in dense fog at K = 3 exposures."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """First and last pixel of an answer's light and of the light behind it, counted from the answer towards far depths."""
 
 ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
-"""Wrong orders of pixels that are tried."""
+"""Wrong orders of pixels that are tried: what seems reversed in each."""
 
 
 class Points(NamedTuple):
@@ -135,7 +134,7 @@ class MapChecks:
         self._orders = _orders()
 
     def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
-        """Doubts about a map, each a sentence that says what to look at; empty if nothing speaks against it.
+        """Doubts about a map, at most one: a sentence that says what to look at; empty if nothing speaks against it.
 
         sweep: a `CountVolume`, or a sweep with `checked`: the lines of counts of POINTS points and of their partners,
         (lines, points, window). intensity: (rows, width). stripe: the estimator's answers, unfiltered.
@@ -330,14 +329,14 @@ class _Counts:
     def of_lines(
         self, partner: int, chosen: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int32], NDArray[np.int32]]:
-        """The counts (a, b, window) as they are stored, with a and b of the lines of chosen points' partner."""
+        """The stored counts (a, b, window), and the indices a, b (chosen,) of line `partner` of chosen points."""
         if self.of_volume:
             return self._sweep.counts, self.points.column[partner, chosen], self.points.row[partner, chosen]
         return self._sweep.checked, np.full(len(chosen), partner, np.int32), chosen.astype(np.int32)
 
 
 def _ever_more(chosen: NDArray[np.int64], first: int) -> Iterator[NDArray[np.int64]]:
-    """Parts of the chosen points, each evenly spread. Each has as many as all before it, the first at least `first`."""
+    """Parts of the chosen points, each evenly spread and as large as all before it; the first has `first` or more."""
     step = 1 << max((len(chosen) // first).bit_length() - 1, 0)
     yield chosen[::step]
     while step > 1:

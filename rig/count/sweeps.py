@@ -1,4 +1,4 @@
-"""From blocks to sweeps: binds and counts the frames of a start, and keeps account of those that are missing."""
+"""From blocks to sweeps: binds and counts the frames of one start of the SPAD, and keeps account of missing ones."""
 
 import logging
 import math
@@ -44,8 +44,8 @@ class FrameCounts:
 class SweepAccount:
     """Account of a sweep, kept after its counts are dropped.
 
-    direction: +1 if the mirror command rose, -1 if it fell; column indices mean the same commands in both directions.
-    index: of its map. gaps: (first, last) numbers of frames lost or repeated. The others are as in `SweepClock`.
+    index: of its map. direction: +1 if the mirror command rose, -1 if it fell; column indices mean the same commands in
+    both directions. gaps: (first, last) numbers of frames lost or repeated. The others are as in `SweepClock`.
     """
 
     index: int
@@ -86,7 +86,8 @@ class FirstSweep:
 
 
 class SweepAssembler:
-    """Turns the blocks of one start into sweeps. The result does not depend on how frames are grouped into blocks."""
+    """Turns the blocks of one start into `maps` sweeps, from `start` (None: sweep 0) on. The result does not depend on
+    how frames are grouped into blocks."""
 
     def __init__(
         self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: FirstSweep | None = None
@@ -230,7 +231,7 @@ class SweepAssembler:
         return x0
 
     def _check(self, block: FrameBlock) -> None:
-        """Raise ProtocolError for a block of another start or frame size, or one that begins before the next frame."""
+        """Raise ProtocolError for a block of another start or frame size, or one that begins before the frame due."""
         header, plan = block.header, self._plan
         widths = {plan.width} if plan.windows is None else {plan.width, plan.windows.width_px}
         # Counters cannot go from one width to another in the middle of a column.

@@ -2,7 +2,7 @@
 
 `rig.count.kernels` does the adding. `SweepCounter` keeps the counts of a whole sweep, unsigned integers (columns, rows,
 window), and `LineCounter` those of a rig with several lines. Estimators that judge a column as soon as it is complete
-have their own counter, which keeps less (`Counter`). All of them also record a `FrameTally`.
+have their own counter, which keeps less. All of them follow `Counter` and also record a `FrameTally`.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ MOST_WIDTH_PX = WORD_PX * 256
 BIN_DARK = -1
 """Bin of a frame with the gate low during the whole exposure."""
 BIN_UNUSABLE = -2
-"""Bin of a frame that is not counted: gate edge inside, off all columns, out of order, repeated or window lost."""
+"""Bin of a frame that is not counted, such as one with a gate edge inside, off all columns, repeated or damaged."""
 BYTE_FRAMES = 255
 """Most frames of a column that counters of 8 bits hold."""
 BYTE_EXPOSURES = 200
@@ -33,7 +33,7 @@ Counts = NDArray[np.unsignedinteger[Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepLayout:
-    """Pixels of each column that are counted: `window` from x0 (columns,) on, on a sensor of rows x width pixels.
+    """Pixels of each column that are counted: `window` pixels from x0 (columns,) on. rows, width: of the sensor.
 
     exposures: frames nominally taken per column. used_px: pixels used per row of a frame; None for whole rows.
     dark: whether there will be frames with the gate low.
@@ -121,9 +121,7 @@ class CountVolume(FrameTally):
 
 
 class Counter(Protocol):
-    """Takes the frames of sweeps, one sweep after the other. Results depend neither on threads nor on the size of
-    blocks.
-    """
+    """Takes the frames of one sweep after the other. Results depend neither on threads nor on the size of blocks."""
 
     def reset(self) -> None:
         """Begin the next sweep."""
@@ -196,7 +194,7 @@ class SweepTally:
 
 
 def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
-    """The counts in a type wide enough for `n_frames` frames of a column without overflow."""
+    """The counts in a type wide enough for columns of `n_frames` (columns,) frames without overflow."""
     most = int(n_frames.max(initial=0))
     for wider in (np.uint16, np.uint32):
         if most <= np.iinfo(counts.dtype).max:
@@ -256,7 +254,7 @@ class SweepCounter:
 
 
 class LineCounter(SweepCounter):
-    """The counter of a rig with several lines. Its bins are places of the mirror, and its frames are whole rows.
+    """The counter of a rig with several lines. Its bins are places of the mirror, and its frames have whole rows.
 
     Frames of a place are added once, and each line's window is read from the result. The layout and the volume have the
     columns of all lines.
@@ -270,7 +268,7 @@ class LineCounter(SweepCounter):
         self.reset()
 
     def finish(self) -> CountVolume:
-        """The counts so far. A column has the frames of its mirror place, at the same distance from its centre."""
+        """The counts so far. A column has its mirror place's frames and their mean distance from the place's centre."""
         place, volume = self._grid.place, super().finish()
         column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
         return replace(volume, n_frames=volume.n_frames[place], column=column)

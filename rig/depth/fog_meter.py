@@ -1,5 +1,4 @@
-"""The fog meter: how dense the medium is, and the light it scatters and the ambient light, from the counts of a single
-map.
+"""The fog meter: density of the medium, light that it scatters, and ambient light, from the counts of a single map.
 
 Rows of a column whose stripe is beyond doubt (clear rows) show the light before and behind the stripe. With s the mean
 of the path lengths from scanner and camera in metres, and G the geometry factor of the haze
@@ -8,9 +7,9 @@ of the path lengths from scanner and camera in metres, and G the geometry factor
     flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
          = ambient + offset + rest haze G exp(-2 extinction s)      behind it
 
-is fitted by maximum likelihood of the counts, binned by s (float64 sums (blocks, 2, bins, 4), see `add_clear_rows`).
-The parameters are haze, extinction, the share `rest` of the haze that was scattered more than once, and `offset`, the
-error of the learned ambient light.
+is fitted by maximum likelihood of the counts, binned by s (sums (blocks, 2, bins, 4) of `rig.depth.kernels`). The
+parameters are haze, extinction, the share `rest` of the haze that was scattered more than once, and `offset`, the error
+of the learned ambient light.
 
 Standard deviations are those of the sandwich, H^-1 (sum of g g^T) H^-1, with H the information of the counts and g the
 likelihood's slope from each block of rows and columns, but at least those of H^-1. What the model leaves out shows as
@@ -18,8 +17,8 @@ scatter between blocks; the sandwich is a jackknife to first order. One error sh
 than once flattens the decay all over the picture. Therefore REST_SHARE times `rest` is added (in quadrature) to the
 extinction's relative error.
 
-Limits. Nothing is carried over between maps: a reading depends on its map only, and is the same whenever the map is
-estimated again. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
+Limits. A reading depends only on its map and on the model with which the map was estimated; no reading is carried over
+to the next map. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of
 them as haze would, and neither extinction nor veil (the haze just before the stripe) is given. Nor are they given for
 several lines at once: the other lines' haze ends at their own stripes, at unknown places, which changes the form of the
 decay.
@@ -55,7 +54,7 @@ FLUX_MAX: Final = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FogFit:
-    """haze, extinction, offset and rest, (4,), and their covariance (4, 4); haze is that at the path `at_m`."""
+    """haze, extinction, offset and rest, (4,), and their covariance (4, 4); haze is that at the mean path `at_m`."""
 
     value: Float64
     covariance: Float64
@@ -63,7 +62,7 @@ class FogFit:
 
 
 def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
-    """Fit of block sums (blocks, 2, bins, 4) over bins of mean path; None if too little was seen before stripes.
+    """Fit of block sums (blocks, 2, bins, 4). path_m: (bins,). None if too little was seen before stripes.
 
     Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
     parameter's error is widened to the sandwich's if that is larger.
@@ -111,8 +110,8 @@ def _inverse(information: Float64) -> Float64:
 class _Data:
     """Data of the fit, (blocks, cells); a cell is a bin of path on one side of the stripe.
 
-    ones, exposures: sums. gain, ambient: means of the geometry factor and of the flux that is no haze. path_m, behind:
-    (cells,), path less the mean path, and whether the cell is behind the stripe.
+    ones, exposures: sums of detections and of exposures. gain, ambient: means of the geometry factor and of the flux
+    that is no haze. path_m, behind: (cells,), path less the mean path, and whether the cell is behind the stripe.
     """
 
     ones: Float64
@@ -123,7 +122,7 @@ class _Data:
     behind: Bools
 
     def started(self, extinction_per_m: float) -> Float64:
-        """Parameters for this extinction, with the haze that gives the ones before stripes."""
+        """Parameters for this extinction, with the haze that explains the sum of ones before stripes."""
         shape = self.gain * np.exp(np.minimum(-2.0 * extinction_per_m * self.path_m, 50.0))
         shape, before = (each[:, ~self.behind] for each in (shape, self.exposures))
         rate = np.minimum(self.ones[:, ~self.behind].sum() / before.sum(), 0.999)
@@ -208,7 +207,7 @@ class FogEstimate:
 def read_fog(
     sweep: Any, stripe: StripeTable, geometry: SweepGeometry, state: Any, where: tuple[Int32, Int32] | None = None
 ) -> FogEstimate:
-    """The fog of one map.
+    """The fog of one map; all None if fewer than LEAST_LINES rows are clear, or if they show too little.
 
     sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: its stripe table, made with the `RowModel`
     `state`. where: lines of counts that are read of a `CountVolume`; None for those of `next_lattice`.

@@ -5,8 +5,8 @@
     inverse depth = (1 - f) p_a.(u, v, 1) + f p_b.(u, v, 1),    f = (x - xa) / (xb - xa)
 
 with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width).
-`add_clear_rows` sums ones, exposures, and exposures weighted with geometry factor and flux, of pixels clearly before
-and clearly behind the stripes of a sweep, float64 per block, side and bin of path.
+`add_clear_rows` adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the
+stripes of a sweep.
 """
 
 from typing import Final
@@ -78,8 +78,8 @@ def fill_rows(
 
 
 SUMS: Final = 4
-"""Sums for each block, side and bin: ones, exposures, and exposures weighted with geometry factor and with flux that is
-no haze."""
+"""Sums for each block, side and bin: ones (detections), exposures, exposures weighted with the geometry factor, and
+exposures weighted with the flux that is no haze."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -62,10 +62,10 @@ class MapsAtOnce(Generic[AnyCounted]):
         return self.alone or bool(self._maps)
 
     def put(self, sweep: AnyCounted, *, last: bool) -> None:
-        """Begin the map of a sweep, after those before it if it needs what is learned from them, or if all threads are
-        at work. last: whether no other sweep follows soon.
+        """Begin the map of a sweep, or make and deliver it if no other map may be made at the same time.
 
-        Raises what making a map raises, of this sweep or of one before.
+        Waits first for earlier maps if this one needs what is learned from them, or if all threads are at work. last:
+        whether no other sweep follows soon. Raises what making a map raises, of this sweep or of an earlier one.
         """
         self.deliver_ready()
         maker, pool = self._maker, self._pool

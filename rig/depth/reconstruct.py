@@ -29,8 +29,8 @@ from rig.threads import RowWorkers
 class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
-    learned: the state that the estimator used, None if it learns nothing. doubts: sentences on why the map may be
-    wrong, judged by its own light (`rig.count.map_checks`).
+    compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
+    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`).
     """
 
     stripe: StripeTable
@@ -50,7 +50,7 @@ def map_geometry(
 
     model: rig model; None for an uncalibrated rig, which gives stripes only and needs sensor (rows, width).
     column_commands: (columns,) mirror command of each column's centre. lines: which line lights which column, if there
-    are several. Raises UsageError without model and sensor, and the errors of `sweep_geometry`.
+    are several. Raises UsageError if model and sensor are both None, and the errors of `sweep_geometry`.
     """
     if model is None:
         if sensor is None:
@@ -75,7 +75,7 @@ class Lane(NamedTuple):
 
 
 class MakesMaps(Protocol):
-    """The part of a `Reconstructor` that a scan uses. Once the counting thread runs, no other thread uses it."""
+    """The part of a `Reconstructor` that a scan uses. Once the counting thread runs, no other thread calls it."""
 
     def counter(self, layout: SweepLayout) -> Counter:
         """Make a counter whose sweeps `map` takes."""
@@ -91,8 +91,8 @@ class Reconstructor:
 
     model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
     estimated with its own, and nothing is learned. kept: the state of an earlier run, used by `joint` if it explains
-    the first map. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
-    chooses one first), and with `learned` for estimators that learn nothing.
+    the first map. Raises KeyError for the estimator `auto` (`rig.scan.estimator` chooses one first), and with `learned`
+    for estimators that learn nothing.
     """
 
     def __init__(

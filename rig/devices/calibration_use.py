@@ -1,7 +1,7 @@
 """Decides whether a calibration may be used: whether it is of this rig, passed its checks, and is not too old.
 
 A measured calibration states its devices, its date and its verdict (`Identity`). One written by hand states
-nothing and is used unchecked. Everything that affects depth is compared: kinds and serial numbers of sensor and
+none of these and is not compared. Everything that affects depth is compared: kinds and serial numbers of sensor and
 scanner, how they are mounted, and the laser lines; for a simulated rig, its geometry. Settings of a scan are not
 compared. A recording's calibration is compared with the devices and the date of the recording.
 
@@ -64,8 +64,8 @@ class KnowsRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationUse:
-    """The calibration of a run. checked: whether it states its rig and so was compared. accepted: reasons against it
-    that the user accepted."""
+    """The calibration of a run. checked: whether it states its rig, without which nothing can be compared. accepted:
+    reasons against it that the user accepted."""
 
     model: RigModel
     checked: bool
@@ -81,9 +81,9 @@ class CalibrationUse:
 
 
 def identity_of(rig: OpenRig) -> Identity:
-    """Identity of an open rig, for a calibration of it that is made now.
+    """Identity of an open rig, with the present date.
 
-    A rig that plays a recording has the identity of the recorded rig.
+    A rig that plays a recording has identity and date of the recorded rig. Then raises what `recorded_identity` does.
     """
     if isinstance(rig.spad, ReplaySpad):
         return recorded_identity(rig.spad.recording.path)
@@ -132,7 +132,7 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
     """The calibration of an open rig, after comparison with the rig; None if the rig has none. Raises UsageError with a
     line for each reason against it.
 
-    accept: whether to use it in spite of the reasons. here: identity of the rig, if the caller has it. Reasons that
+    accept: whether to use it in spite of the reasons. here: the rig's identity, if the caller has it. Reasons that
     were accepted when a recording was taken stay accepted for the recording's own calibration.
     """
     if rig.model is None:
@@ -143,8 +143,8 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
 
 
 def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = False) -> CalibrationUse:
-    """The calibration of a cube of frames whose rig is unknown. Only its verdict and checks count. Raises UsageError as
-    `calibration_use` does.
+    """The calibration of a cube of frames whose rig is unknown: only the calibration's verdict and noted checks count.
+    Raises UsageError as `calibration_use` does.
     """
     return _used(model, file, refusals(model, file, None), accept)
 
@@ -184,7 +184,7 @@ def _used(
 
 
 def _foreign(made: Identity, here: Identity) -> list[Refusal]:
-    """A reason for each part that both identities name and that differs."""
+    """A reason for each kind or serial number that both identities state and that differs."""
     of = f" of the rig '{made.name}'" if made.name else ""
     found = []
     for what, ours, theirs in (("", *_comparable(made, here)), (" serial number", made.serials, here.serials)):
@@ -195,7 +195,7 @@ def _foreign(made: Identity, here: Identity) -> list[Refusal]:
 
 
 def _comparable(made: Identity, here: Identity) -> tuple[dict[str, str], dict[str, str]]:
-    """Kinds of both. For a simulated world: the digest of its geometry, or the file name if one rig has no digest."""
+    """Kinds of both. If both state a digest of a geometry, `world` is that, or name and digest if digests differ."""
     both = dict(made.kinds), dict(here.kinds)
     digests = [kinds.pop(_GEOMETRY, "") for kinds in both]
     if all(digests):
@@ -241,7 +241,7 @@ def _accepted_before(rig: OpenRig) -> frozenset[str]:
 
 
 def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
-    """The reasons against a run's calibration that the user accepted, for the summary."""
+    """The accepted reasons against a run's calibration as lines for the summary; empty without a calibration."""
     return () if use is None else tuple(map(str, use.accepted))
 
 
@@ -260,7 +260,7 @@ def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[st
 
 
 def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """The outcome of the comparison for a manifest: `checked`, or 'accepted' with the reasons accepted."""
+    """The outcome of the comparison for a manifest: the word `checked`, or 'accepted' and the reasons, if any."""
     if not accepted:
         return {"check": checked}
     return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
@@ -294,7 +294,7 @@ def _beside(file: Path) -> Path:
 
 
 def notes_on(file: Path | None, model: RigModel) -> dict[str, dict[str, Any]]:
-    """Notes on this very calibration by the check's name; empty without a file. Raises UsageError if unreadable."""
+    """Notes on this very calibration, by the name of the check; empty without a file. Raises UsageError if damaged."""
     if file is None:
         return {}
     notes = _read_notes(_beside(file))

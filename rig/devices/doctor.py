@@ -49,7 +49,7 @@ LOOK_S = 30.0
 """Longest examination of the frames, in seconds."""
 FILL_S = 5.0
 DARK_PROGRAM = (Pulse(0, None), Pulse(0, 1e-3))
-"""Program of the sync source that keeps all outputs low, and ends once it was triggered."""
+"""Program of the sync source that keeps all outputs low, and ends once it has been triggered."""
 _LEAST_LINES = 3
 
 
@@ -57,8 +57,8 @@ _LEAST_LINES = 3
 class LineMarkers:
     """Line markers of a sweep, compared with its plan.
 
-    rate_hz: markers per second. jitter_columns: standard deviation of their times. clock_error: relative excess of the
-    scanner's clock over nominal, in the SPAD's time."""
+    rate_hz: markers per second. jitter_columns: standard deviation of their times, in columns. clock_error: relative
+    excess of the scanner's clock over nominal, in the SPAD's time."""
 
     rate_hz: float
     jitter_columns: float
@@ -69,9 +69,9 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of ones, from the first frame of each block. n_bytes: number
-    of bytes of pixels; seconds: time from the start of the mirror until all frames had come. counters: the SPAD's own,
-    read before it was stopped. triggered: whether the sync source's program ran to its end.
+    records: (n,), records of all frames. dark_share: share of pixels that fired, in the first frame of each block.
+    n_bytes: bytes of all frames' pixels. seconds: from the start of the mirror until all frames had come. counters: the
+    SPAD's own, read before it was stopped. triggered: whether the sync source's program ran to its end.
     """
 
     records: NDArray[np.void]
@@ -82,7 +82,7 @@ class DarkLook:
     triggered: bool
 
     def lines(self, plan: ScanPlan) -> LineMarkers | None:
-        """The line markers after the first scan marker, as far as they were seen; None if there are too few."""
+        """The line markers after the first scan marker, at most as many as planned; None if fewer than three."""
         marks = self.records["marks"].astype(np.int64)
         scans, at = (np.flatnonzero(marks & int(mark)) for mark in (Mark.SCAN, Mark.LINE))
         planned_s = np.flatnonzero(plan.waveform.markers & MARKER_LINE) / float(plan.point_rate_hz)
@@ -100,7 +100,7 @@ class DarkLook:
 
 
 def look(rig: OpenRig, plan: ScanPlan, stride: int) -> DarkLook:
-    """Run the scanner for a sweep with the gate low. Raises DeviceError."""
+    """Run the scanner for a sweep with the gate low. Raises DeviceError. stride: bytes of the SPAD's largest block."""
     rig.scanner.load(plan.waveform, plan.scanner_repeats(1))
     rig.sync.program(DARK_PROGRAM, 1)
     if rig.guard is not None:  # frames may come late here: nothing can shine
@@ -148,7 +148,7 @@ class Finding:
 
 
 def examine(config: RigConfig, folder: Path) -> list[Finding]:
-    """Examine everything. folder: where a scan would write. Faults of config and devices become findings."""
+    """Examine everything. folder: where a scan would write. Faults of config and devices are findings, not errors."""
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
@@ -206,7 +206,7 @@ def _laser(rig: OpenRig) -> Finding:
 
 
 def _calibration(rig: OpenRig) -> Finding:
-    """Finding on the calibration. A rig without one can scan: there are stripes then, and no depth."""
+    """Finding on the calibration. A rig without one can scan, but its maps have stripes and no depth."""
     file, model = rig.config.calibration, rig.model
     if model is None:
         return Finding("calibration", True, "none: a scan gives stripes but no depth")
@@ -219,7 +219,7 @@ def _calibration(rig: OpenRig) -> Finding:
 
 
 def _plan(plan: ScanPlan) -> Finding:
-    """Finding on the plan. A plan that exceeds the link's rate was refused before."""
+    """Finding on the plan, which is ok: one that exceeds the link's rate is refused before."""
     link = f"{plan.bytes_per_s / 1e6:.0f} MB/s"
     if plan.readout_bytes_per_s is not None:
         link = f"read out at {plan.readout_bytes_per_s / 1e6:.0f} MB/s"

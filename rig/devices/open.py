@@ -1,6 +1,6 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-It also checks that the user consents to light: a real laser or gate needs that (`--arm`), a simulated one does not.
+It also checks that the user consents to light (`--arm`), as a real laser or gate requires; a simulated one does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -85,8 +85,8 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`. A laser
-    that cannot be opened is told to switch off all the same, if its kind has bytes for that: it may hear us.
+    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`. If its
+    kind has bytes that switch it off, these are sent all the same: it may receive what it does not answer.
 
     Raises DeviceError if the world, if there is one, cannot be made."""
     with ExitStack() as stack:
@@ -95,7 +95,7 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
         for slot in reversed(GUARDED):  # the gate first: some lasers take seconds to open
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
-            except Exception as error:  # no error of one device may keep the other one on
+            except Exception as error:  # an error of one device must not keep the other one on
                 trouble.append(f"{slot}: {error}{_switched_off_unheard(slot, getattr(config, slot), surroundings)}")
         yield opened["sync"], opened["laser"]
 
@@ -113,7 +113,7 @@ def _switched_off_unheard(slot: str, config: KindConfig, surroundings: Surroundi
 
 
 def check_files(config: RigConfig) -> None:
-    """Open every file that a config names, as `open_rig` does, but no device. Raises UsageError with a line per
+    """Check every file that a config names, as `open_rig` would, but open no device. Raises UsageError with a line per
     problem.
     """
     problems: list[str] = []
@@ -175,7 +175,7 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock and world of the config, with the world's devices. Raises DeviceError if the world cannot be made."""
+    """Clock, world and the ports of devices that it emulates. Raises DeviceError if the world cannot be made."""
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)
@@ -192,7 +192,7 @@ def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundi
 
 
 def _tapped(surroundings: Surroundings, slot: str, file: TapFile | None, stack: ExitStack) -> Surroundings:
-    """Surroundings with a tap for a slot's device, if traffic is recorded; flushed once the device is closed."""
+    """Surroundings with a tap for a slot's device, if traffic is recorded. It is flushed after the device is closed."""
     if file is None:
         return surroundings
     tap = Tap(file, slot)
@@ -224,7 +224,7 @@ def _load_model(config: RigConfig, problems: list[str]) -> RigModel | None:
 def _pause_if_emitting(laser: LineLaser) -> list[str]:
     """Pause a laser that emits before this program armed it. Returns the reason to refuse the scan, if there is one.
 
-    A laser that only its gate ends must be on already, so that it emits is no reason."""
+    If only the gate can end a laser's light, the laser must be on already; that it emits is then no reason."""
     try:
         if laser.gate_only or not laser.status.emission:
             return []
@@ -235,7 +235,7 @@ def _pause_if_emitting(laser: LineLaser) -> list[str]:
 
 
 def light_problems(config: RigConfig, arm: bool) -> list[str]:
-    """Problems with letting light out: every real laser and gate needs the user's consent (`arm`)."""
+    """Problems with letting light out: a laser or gate that is not simulated or emulated needs consent (`arm`)."""
     devices = {slot: getattr(config, slot) for slot in GUARDED}
     real = [
         slot

@@ -22,7 +22,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import replay_plan
 
 HOLD_EXPOSURES = 10
-"""From this number of exposures per column on, simulated light is constant in a column; below, in parts of one."""
+"""From this number of exposures per column on, simulated light is constant in a column; below it, in parts of one."""
 
 
 @runtime_checkable
@@ -82,7 +82,7 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""A burst must have room for this time in seconds between the SPAD's start and the first scan marker.
+"""Seconds between the SPAD's start and the first scan marker for which a burst must have room.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """
@@ -95,12 +95,12 @@ They are added if the memory has room and the SPAD has markers: reading then end
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Seconds of a burst that are reserved for the time before its first scan marker."""
+    """Seconds before the first scan marker for which a burst must have room."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 
 def spare_lead_s(rig: OpenRig) -> float:
-    """Additional seconds before the first marker for which a burst may have room."""
+    """Further seconds before the first scan marker for which a burst gets room if its memory is large enough."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 
@@ -108,7 +108,7 @@ def most_sweeps(rig: OpenRig, plan: ScanPlan) -> int | None:
     """Largest number of sweeps of one start that fit a burst's memory and the sync source's program; None for any
     number.
 
-    The number is at least 1. SPAD and sync source may still refuse a start with 1.
+    At least 1, even if not one sweep fits; SPAD or sync source may then refuse the start.
     """
     legs = len(plan.legs)
     repeats = rig.sync.most_repeats(sync_program(plan, legs)[0])

@@ -1,11 +1,11 @@
 """Compiled estimators `argmax` (brightest pixel of the row, the naive reference) and `edge` (from the report that this
 project follows).
 
-`argmax` takes the largest count inside the window, and the smallest x among equal ones. `edge` fits an exponential
-background to the near side of the row and finds the pixel with the largest product of (count - background) and the drop
-of the level from the 8 px before to the 8 px behind. It takes the largest count within 2 px of that pixel. Counts are
-integers (columns, rows, window); answers are float32 (rows, columns), refined to sub-pixel positions with the two
-neighbours. Neither uses a model or learns one.
+`argmax` takes the largest count inside the search window, and the smallest x among equal ones. `edge` fits an
+exponential background to the near side of the row and finds the pixel with the largest product of (count - background)
+and the drop of the level from the 8 px before it (nearer) to the 8 px behind it (farther). The answer of `edge` is the
+pixel of the largest count within 2 px of it. Counts are integers (columns, rows, window); answers are float32 (rows,
+columns), refined to sub-pixel positions with the two pixels beside. Neither estimator uses or learns a model.
 """
 
 from dataclasses import dataclass
@@ -32,9 +32,9 @@ NEAR_SHARE: Final = 0.25
 
 @numba.njit(cache=True, nogil=True)
 def sub_pixel(weight: Float64, peak: int, length: int) -> float:
-    """Offset of the line from the peak's pixel, -0.5 to 0.5 px: centroid of the pixel and its two neighbours, after the
-    smaller neighbour's weight is subtracted from all three. 0 where all three are equal, and at either end of the row.
-    """
+    """Offset of the line from the peak's pixel towards higher indices, -0.5 to 0.5 px: centroid of the pixel and its
+    two neighbours, after the smaller neighbour's weight is subtracted from all three. 0 where nothing remains, and at
+    either end of the row."""
     if peak <= 0 or peak >= length - 1:
         return 0.0
     left, centre, right = weight[peak - 1], weight[peak], weight[peak + 1]
@@ -85,8 +85,8 @@ def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, lengt
 
 @numba.njit(cache=True, nogil=True)
 def _near_fit(n: Float64, length: int) -> tuple[float, float]:
-    """Fit an exponential to the near part of a row, from the sums of its two halves. Returns the level at the nearest
-    pixel and the decay per pixel, at least 0; (0, 0) if the row is too short or the nearer half has no count."""
+    """Fit an exponential to the near part of a row, from that part's two halves. Returns the level at the nearest pixel
+    and the decay per pixel, at least 0; (0, 0) if the row is too short or the nearer half has no count."""
     half = max(int(length * NEAR_SHARE) // 2, 2)
     if 2 * half > length:
         return 0.0, 0.0
@@ -200,7 +200,7 @@ def _flux(count: float, k: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Peaks:
-    """Peak search on every row. with_edge: whether peaks are weighted with the drop behind them."""
+    """Peak search on every row. with_edge: whether peaks are weighted with the drop behind them (`edge`)."""
 
     with_edge: bool
     threads: int = 2

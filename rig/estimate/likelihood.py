@@ -6,7 +6,7 @@ how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimat
 confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and
 estimated twice, because pixels that the first estimate shows to lie behind the stripe tell the ambient light. Every
 later map is estimated with a model learned from earlier maps alone: column by column while its frames come in, or when
-it is complete if it has more than BYTE_EXPOSURES exposures.
+it is complete if its columns have more than BYTE_EXPOSURES exposures.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ from rig.threads import RowWorkers
 
 
 class Likelihood:
-    """Row likelihood with the state it has learned so far; `model` is None until a map was good enough to learn from.
+    """Row likelihood with the state it has learned so far.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state.
@@ -42,7 +42,7 @@ class Likelihood:
 
     @property
     def model(self) -> RowModel | None:
-        """The state with which the next map will be estimated."""
+        """The state with which the next map will be estimated; None until a map was good enough to learn from."""
         return self._lessons.model
 
     @model.setter
@@ -78,14 +78,14 @@ class Likelihood:
         return self._at[1]
 
     def _light_of(self, model: RowModel) -> tuple[float, int]:
-        """A model's median ambient light, and the number of pixels over which a stripe's light is summed; kept."""
+        """A model's median ambient light, and the number of pixels over which a stripe's light is summed."""
         if self._light is None or self._light[0] is not model:
             line_px = 2 * signal_reach(line_profile(model.line_sigma_px)) + 1
             self._light = model, float(np.median(model.ambient)), line_px
         return self._light[1:]
 
     def judge(self, geometry: SweepGeometry, exposures: int, *, dark: bool) -> SearchTables:
-        """Tables of the search under the present model; made once per model."""
+        """Tables of the search under the present model, made again only when something has changed."""
         assert self.model is not None, "the first map is learned from counts"
         return self._lessons.tables(LearningSetting(self.model, geometry, exposures, dark), self._workers)
 
@@ -95,7 +95,7 @@ def _judge(setting: LearningSetting, workers: RowWorkers) -> SearchTables:
 
 
 class _LikelihoodCounter:
-    """Counts sweeps completely without a model or beyond BYTE_EXPOSURES exposures; else judges columns as they come."""
+    """Counts whole sweeps if there is no model or over BYTE_EXPOSURES exposures; else judges columns as they come."""
 
     def __init__(self, of: Likelihood, layout: SweepLayout, geometry: SweepGeometry, workers: RowWorkers) -> None:
         self._of, self._layout, self._geometry, self._workers = of, layout, geometry, workers

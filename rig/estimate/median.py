@@ -16,7 +16,7 @@ REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
 """Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
 SURE = np.float32(0.999999)
-"""Limit of each confidence in the probability that none of several answers is right: log(1 - confidence) is finite."""
+"""Largest confidence used in the probability that none of several answers is right: log(1 - SURE) is finite."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -62,11 +62,11 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
     """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
 
-    reference_px: (rows, columns), the position of the column's line at a fixed depth; where NaN, the result is NaN.
-    The new confidence is a product. First factor: the share of the confidence in the 5x5 that belongs to answers within
-    1 px of the median. Second factor: the probability that at least one of these answers is right; if `coupled`, their
-    mean confidence, since answers that influence each other also agree where nothing is lit. x_sd_px becomes the
-    standard deviation of a median of these answers.
+    reference_px: (rows, columns), the position of the column's line at a fixed depth. Where it or x_px is NaN, the
+    result is NaN and has confidence 0. The new confidence is a product. First factor: the share of the confidence in
+    the 5x5 that belongs to answers within 1 px of the median. Second factor: the probability that at least one of these
+    answers is right; if `coupled`, their mean confidence, since answers that influence each other also agree where
+    nothing is lit. x_sd_px becomes the standard deviation of a median of these answers.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

@@ -1,4 +1,4 @@
-"""Stripe estimators by name, which turn the counts of a sweep into a stripe table.
+"""Stripe estimators by name. An estimator turns the counts of a sweep into a stripe table.
 
 `create_estimator` makes one that has learned nothing yet. `recalling` makes one that estimates earlier maps again, bit
 for bit, from the learned state that was kept with each of them.
@@ -37,16 +37,16 @@ class Learned(Protocol):
         ...
 
     def arrays(self) -> "dict[str, NDArray[np.generic]]":
-        """Every field as an array, enough to estimate the map again bit for bit."""
+        """Every field that is not None, as an array: enough to estimate the map again bit for bit."""
         ...
 
 
 class Estimator(Protocol):
-    """An estimator. used: the state with which the last map was estimated; None if the estimator does not learn."""
+    """An estimator; those in LEARNING keep what they have learned for the next map."""
 
     @property
     def used(self) -> Learned | None:
-        """State of the last map."""
+        """State with which the last map was estimated; None before the first map, or if it learns nothing."""
         ...
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
@@ -73,11 +73,11 @@ class ManyMaps(Protocol):
     """An estimator that can estimate several maps at the same time."""
 
     def most_at_once(self, geometry: "SweepGeometry") -> int:
-        """Number of maps for which there is memory; 1 if each map needs the one before."""
+        """Number of maps that can be under way at the same time. If it is less than 2, use `estimate` for each map."""
         ...
 
     def solver(self) -> Any:
-        """Memory and a thread for one map at a time."""
+        """Memory for one map at a time, which is made on the thread that calls `run`."""
         ...
 
     def may_begin(self, frames: int) -> bool:
@@ -85,7 +85,7 @@ class ManyMaps(Protocol):
         ...
 
     def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
-        """Begin a map with a solver that no other map uses. Its `run` may be called on any thread; then call `end`."""
+        """Begin a map with a solver that no other map uses. Call the result's `run` on any thread, then `end`."""
         ...
 
     def end(self, work: Any) -> None:
@@ -101,9 +101,9 @@ class LearnsFromStream(Estimator, Protocol):
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """An estimator that learns nothing and estimates each map with its own state, the next one of `learned`.
+    """An estimator that learns nothing and estimates each map with its own state, as `Recalled` does.
 
-    name: one of LEARNING, else KeyError.
+    name: one of LEARNING, else KeyError. learned: at least one. temporal_prior: whether the maps were made with it.
     """
     return (RecalledMaps if name == "joint" else Recalled)(
         _learning(name, threads, learns=False, temporal_prior=temporal_prior), learned
@@ -138,8 +138,8 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool, ke
 
 
 class Recalled:
-    """Estimates each map with its own state, and maps beyond these with the last state. of: an estimator of LEARNING
-    that does not learn any more. states: at least one."""
+    """Estimates each map with its own state, the next of `states` (at least one), and further maps with the last state.
+    of: an estimator of LEARNING that does not learn."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of
@@ -147,7 +147,7 @@ class Recalled:
 
     @property
     def used(self) -> Learned | None:
-        """State of the last map."""
+        """State with which the last map was estimated."""
         return self._of.used
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":
@@ -182,7 +182,7 @@ class RecalledMaps(Recalled):
         return self._many.solver()
 
     def may_begin(self, frames: int) -> bool:
-        """Always: every map has a state of its own, or the last one."""
+        """True: no map's state depends on the maps under way."""
         return True
 
     def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:

@@ -24,7 +24,7 @@ from rig.run_folder.manifest import read_manifest
 
 EXPORT_KINDS: Final = ("npy", "hdf5", "ply", "png", "mp4")
 PICTURE_KINDS: Final = ("png", "mp4")
-"""Kinds that show a view."""
+"""Kinds of pictures, which show depth, intensity or sums of frames (`View`)."""
 FILMS_PER_S: Final = 25.0
 FRAMES_PER_PICTURE: Final = 100
 
@@ -139,7 +139,7 @@ class _Export:
         return bool(segment_files(self._run)) and (self._run.is_dir() or self._run.match(f"{SEGMENTS}*"))
 
     def _blocks(self) -> Iterator[FrameBlock]:
-        """Yield all sound blocks of the recording, and note other blocks as damage."""
+        """Yield all sound blocks of the recording, and note problems with others as damage."""
         try:
             recording = RunRecording(self._run)
             done = 0
@@ -153,7 +153,7 @@ class _Export:
         self.damage += recording.problems
 
     def _manifest(self) -> dict[str, Any]:
-        """The run's manifest; empty if there is none, or if it is damaged; the damage is noted."""
+        """The run's manifest; empty if it is missing or damaged. Damage is noted."""
         try:
             return read_manifest(self._run) or {}
         except DamagedRecordingError as error:
@@ -161,7 +161,7 @@ class _Export:
             return {}
 
     def _view(self) -> View:
-        """The view to show. Raises UsageError if the run has nothing of it."""
+        """The view to show. Raises UsageError if the run lacks it, or if frames are to be summed for another view."""
         there = {
             "depth": bool(self._maps.files("depth", ".npy")),
             "intensity": bool(self._maps.files("intensity", ".png")),
@@ -178,7 +178,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """The next step if there are no maps. Raises UsageError if there are no frames to make maps of either."""
+        """How to make missing maps, as text. Raises UsageError if there is no recording to make them of."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

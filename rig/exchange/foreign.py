@@ -23,8 +23,8 @@ class ForeignFrames:
 
     chunks: returns the frames in pieces, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost
     pixel.
-    origin: for the manifest. ranges: (first, number of frames) of each stretch without a gap, if the file has gaps.
-    hints: lines for the user about what may be wrong.
+    origin: facts for the manifest. frame_rate: in Hz; None if unknown. ranges: (first, number of frames) of each
+    stretch without a gap; empty if unknown. hints: lines for the user about what may be wrong.
     """
 
     width: int
@@ -38,10 +38,10 @@ class ForeignFrames:
 
 
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
-    """List the given files in that order. A folder stands for all files with `suffix` in it and its subfolders.
+    """List the given files in their order. A folder stands for all files with `suffix` in it and its subfolders.
 
     A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if a file is
-    missing, a folder holds none, or none is named.
+    missing, a folder holds none, or nothing is named.
     """
 
     def natural(file: Path) -> list[tuple[int, str]]:
@@ -68,7 +68,7 @@ def bytes_of(file: Path) -> NDArray[np.uint8]:
 
 
 def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """Yield `frames` (n, ...) in pieces of `CHUNK_BYTES`."""
+    """Yield `frames` (n, ...) in pieces of whole frames, at most `CHUNK_BYTES` if one fits."""
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]

@@ -6,7 +6,7 @@
     /maps/x_px confidence x_sd_px signal haze, also x2_px confidence2 if the estimator has them (maps, rows, columns)
     /clock/tick_hz tick_hz_numerator tick_hz_denominator frame_period_ticks exposure_ticks (1, 1)
 
-MATLAB sees dimensions in reverse order, and its arrays have at least two. A MAT-file has 512 bytes of header before the
+MATLAB sees dimensions in reverse order, and its arrays have two or more. A MAT-file has 512 bytes of header before the
 HDF5 part, and the name of a MATLAB class with each array and group (MAT-file format 7.3, as MATLAB writes it).
 """
 
@@ -102,7 +102,7 @@ def _write_frames(file: Any, log: FrameLog) -> None:
 
 
 def _write_maps(group: Any, maps: MapFiles) -> None:
-    """Write the maps one by one, since those of a run may not fit into memory together."""
+    """Write the maps one by one, since they may not fit into memory together."""
     for place, index in enumerate(maps.indices):
         arrays = maps.arrays(index)
         _require_room(Path(group.file.filename), sum(values.nbytes for values in arrays.values()))
@@ -126,7 +126,7 @@ def _array(group: Any, name: str, values: NDArray[Any], matlab: str | None = Non
 
 
 def _growing(group: Any, name: str, first: NDArray[Any]) -> Any:
-    """Make a dataset for arrays like those of `first` (n, ...), empty for now."""
+    """Make an empty dataset that can grow along its first axis, for arrays like `first` (n, ...)."""
     shape = first.shape[1:]
     chunk = max(1, _CHUNK_BYTES // max(1, math.prod(shape) * first.itemsize))
     fill = np.nan if first.dtype.kind == "f" else 0

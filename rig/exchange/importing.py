@@ -1,8 +1,8 @@
 """`rig import`: makes a recording from the frames of another program.
 
 Foreign files contain pixels and little else. What they do not say is left open in the recording: there are no markers,
-and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). The pixels are those of the files, bit
-by bit.
+and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). The pixels are those of the files, if
+need be turned upright.
 """
 
 import shutil
@@ -35,7 +35,7 @@ from rig.scan.run import versions
 
 
 class _Kind(NamedTuple):
-    """A kind of foreign files. upright_deg: the turn that makes their frames upright."""
+    """A kind of foreign files. forms: names for --form. upright_deg: the turn that makes their frames upright."""
 
     suffix: str
     forms: tuple[str, ...]
@@ -44,7 +44,7 @@ class _Kind(NamedTuple):
 
 
 _KINDS: Final = {
-    # As the vendor's samples and the driver (`rotation`) turn them.
+    # The vendor's samples and the driver (`rotation`) turn frames by 90 degrees.
     "pi-imaging": _Kind(".bin", raw_files.PI_IMAGING_FORMS, raw_files.open_pi_imaging, 90),
     "swissspad2": _Kind(".bin", raw_files.SWISSSPAD2_FORMS, raw_files.open_swissspad2),
     "photoncube": _Kind(".npy", photoncube.FORMS, photoncube.open_photoncube),
@@ -58,7 +58,8 @@ _MIN_RATE_HZ: Final = 0.001
 
 @dataclass(frozen=True, slots=True)
 class ImportResult:
-    """Result of an import. gaps: [first, last] numbers of frames that the source says were lost."""
+    """Result of an import. frame_rate_hz: None if unknown. gaps: (first, last) of frames that the source says were
+    lost. hints: lines for the user about what may be wrong."""
 
     folder: Path
     kind: str
@@ -85,7 +86,7 @@ def import_frames(
 
     kind: pi-imaging, swissspad2 or photoncube.
     files: in order; a folder stands for the files in it.
-    request, changes: how they are read, as an `ImportRequest` or by the names of its fields.
+    request, changes: how files are read, as an `ImportRequest` or by the names of its fields.
     progress: called with the number of frames done and the total.
     Raises UsageError, one line per problem, for files or options that cannot be used; RecordingError if writing fails.
     """
@@ -152,7 +153,7 @@ def import_frames(
 
 
 def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
-    """Check that all options fit the kind, and return the quarter turn."""
+    """The turn in degrees. Raises UsageError for options that do not fit the kind."""
     if kind not in _KINDS:
         raise UsageError(f"import kind {kind!r} is unknown; choose one of {', '.join(_KINDS)}")
     forms, form, rows, turns = _KINDS[kind].forms, request.form, request.rows, get_args(QuarterTurn)
@@ -170,7 +171,7 @@ def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
 
 
 def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.uint8]]:
-    """Yield upright chunks uint8 (n, height, row bytes), with rows padded to whole words and pad bits of 0."""
+    """Yield upright chunks uint8 (n, height, row bytes), with rows padded to whole 64-bit words by bits of 0."""
     width, height = turned_size(foreign.width, foreign.height, turn)
     last_byte = np.uint8(0xFF << (-foreign.width % 8) & 0xFF)
     for chunk in foreign.chunks():
@@ -185,7 +186,7 @@ def _turned(foreign: ForeignFrames, turn: QuarterTurn) -> Iterator[NDArray[np.ui
 
 
 def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
-    """Tick frequency, and ticks per frame: the largest of 1000, 100, 10, 1 with a frequency that a header can hold."""
+    """Tick rate in Hz and ticks per frame: 1000, 100, 10 or 1, as many as a header can hold. 1 and 1 without a rate."""
     if rate is None:
         return Fraction(1), 1
     rate = rate.limit_denominator(_MAX_TICK_HZ // max(1, -(-rate.numerator // rate.denominator)))
@@ -196,7 +197,7 @@ def _clock(rate: Fraction | None) -> tuple[Fraction, int]:
 def _blocks(
     foreign: ForeignFrames, turn: QuarterTurn, ranges: Iterable[tuple[int, int]], rate: Fraction | None
 ) -> Iterator[FrameBlock]:
-    """Make blocks of consecutive upright frames; the first and the last one are marked as such."""
+    """Yield blocks of consecutive upright frames; the first block and the last one are flagged as such."""
     width, height = turned_size(foreign.width, foreign.height, turn)
     tick_hz, ticks = _clock(rate)
     stride = max(_BLOCK_BYTES, BlockLayout(1, width, height).min_stride)

@@ -2,7 +2,7 @@
 
 The array is uint8 (frames, height, ceil(width / 8)), most significant bit first, with the received frames one after the
 other. `frames.json` has what the array cannot hold: clock, numbers and gaps, markers, windows, collected block by block
-by `FrameLog`. If the camera of whole frames is known, `transforms.json` makes it a data set for visionsim.
+by `FrameLog`. If frames are whole and their camera is known, `transforms.json` makes it a data set for visionsim.
 """
 
 import json
@@ -23,7 +23,7 @@ from rig.run_folder.folder import RunFolder, json_text
 
 CUBE: Final = "frames.npy"
 Ranges = list[tuple[int, int, int]]
-"""(run id of the start, first frame, number of frames) of each stretch without a gap; of gaps (run id, first, last)."""
+"""(run id of the start, first frame, number of frames) of stretches without a gap; (run id, first, last) of gaps."""
 _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 """Pose for visionsim: the camera does not move, and its own frame is the world's."""
 
@@ -74,7 +74,7 @@ class FrameLog:
         }
 
     def ranges(self) -> Ranges:
-        """Ranges of consecutive frames, in order."""
+        """The stretches without a gap, in order."""
         ranges: Ranges = []
         for run, numbers, *_ in self._parts:
             if len(numbers) == 0:
@@ -87,7 +87,7 @@ class FrameLog:
         return ranges
 
     def gaps(self) -> Ranges:
-        """Frames that are missing between others of their start, (run id, first, last)."""
+        """The gaps between frames of one start."""
         return [
             (run, first + n, next_first - 1)
             for (run, first, n), (next_run, next_first, _) in pairwise(self.ranges())
@@ -130,7 +130,7 @@ def _spans(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
 
 
 def _changes(values: NDArray[np.integer[Any]]) -> Iterator[tuple[int, int]]:
-    """(index, value) wherever the value differs from the one before."""
+    """(index, value) of the first value and of each that differs from the one before."""
     for index in np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]])) if len(values) else ():
         yield int(index), int(values[index])
 
@@ -182,11 +182,11 @@ class MapFiles:
         self.indices = sorted(int(file.stem) for file in run.glob("stripe/*.npz") if file.stem.isdigit())
 
     def files(self, folder: str, suffix: str) -> list[Path]:
-        """Files of one kind in order of the maps: depth, .npy; intensity, .png; cloud, .ply."""
+        """Files of one kind (such as 'depth', '.npy') in the order of the maps."""
         return sorted(self._run.glob(f"{folder}/*{suffix}"))
 
     def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
-        """Stripe table of a map, (rows, columns) each, and its depth_m (height, width) if the rig is calibrated."""
+        """Stripe table of a map, (rows, columns) each, and depth_m (height, width) if the rig is calibrated."""
         arrays = load(self._run / "stripe" / f"{index:06d}.npz", load_arrays)
         file = self._run / "depth" / f"{index:06d}.npy"
         return {**arrays, "depth_m": load(file)} if file.exists() else arrays

@@ -41,7 +41,7 @@ class _Cube:
 def open_photoncube(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open cubes as one sequence of frames. Raises UsageError, a line per problem, for files that are no such cubes.
 
-    If all bytes are 0 or 1, the user, or a file beside the cube, must state that they are packed.
+    If all bytes are 0 or 1 and some are 1, the user or a file beside the cube must state that they are packed.
     """
     cubes = each_or_problems(files, lambda file: _open(file, packed=asked.form == "packed"))
     if len({(cube.width, cube.frames.shape[1:]) for cube in cubes}) > 1:
@@ -88,7 +88,7 @@ def _open(file: Path, *, packed: bool) -> _Cube:
 
 
 def _beside(file: Path) -> Mapping[str, Any]:
-    """The JSON that `rig export` or visionsim wrote beside a cube; empty if there is no such file."""
+    """The JSON that `rig export` or visionsim wrote beside a cube; empty if there is none for this cube."""
     for sidecar in (file.with_suffix(".json"), file.with_name(TRANSFORMS)):
         try:
             content = parse_json(sidecar.read_text(encoding="utf-8"))
@@ -136,7 +136,7 @@ def _frame_rate(beside: Mapping[str, Any]) -> Fraction | None:
 
 
 def _ranges(beside: Mapping[str, Any], n_frames: int) -> tuple[tuple[int, int], ...]:
-    """Ranges [first frame, frames] of a cube whose frames are of one start of the SPAD; empty for any other."""
+    """(first, number of frames) of each stretch without a gap; empty if they are of several starts or do not fit."""
     stated = beside.get("ranges", ())
     try:
         ranges = tuple((int(first), int(n)) for _, first, n in stated)

@@ -25,7 +25,7 @@ Picture = NDArray[np.uint8]
 
 
 def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
-    """Make one picture of each map, all of the same size. The colour scale of the first depth map is used for all.
+    """Make one picture of each map. The colour scale of the first depth map with any depth is kept for all later ones.
 
     Raises UsageError if a file cannot be read."""
     if view == "intensity":
@@ -45,10 +45,10 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
-    """Sum received frames in groups, and draw the square roots of the sums on the whole sensor as grey levels.
+    """Sum received frames in groups, and draw the square roots of the sums as grey levels, for the whole sensor.
 
-    An incomplete last group is left out. White is the level of the brightest pixels of the first picture, so that a
-    film does not flicker.
+    An incomplete last group is left out. The brightest pixels of the first picture set the level of white for all, so
+    that a film does not flicker.
     """
     white = 0.0
     for counts in _sums(blocks, frames_per_picture):
@@ -65,8 +65,8 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if OpenCV cannot write it here,
-    or only a part of it."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if this OpenCV writes no films or
+    only a part of the film was written."""
     import cv2
 
     film = None
@@ -92,7 +92,7 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
 
 
 def _sums(blocks: Iterable[FrameBlock], n: int) -> Iterator[NDArray[np.uint32]]:
-    """Yield the sums of n frames each, (sensor height, sensor width), with each window at its place."""
+    """Yield sums of n frames each, uint32 (sensor height, sensor width), with the frames' windows in their places."""
     counts: NDArray[np.uint32] | None = None
     missing = n
     for block in blocks:

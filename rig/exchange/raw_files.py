@@ -2,7 +2,7 @@
 
 SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
 significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
-Sparse lists are u32 little-endian numbers of the pixels that fired, row by row; the frame's pixel count ends a frame.
+Sparse lists are u32 little-endian numbers of the pixels that fired, counted row by row; rows x 512 ends a frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper
@@ -37,13 +37,13 @@ _LSB_FIRST: Final = np.packbits(np.unpackbits(np.arange(256, dtype=np.uint8), bi
 """Bytes with their bits reversed."""
 _JUDGED_FRAMES: Final = 512
 _JUDGED_SIGMAS: Final = 10.0
-"""Even and odd frames of one scene differ by fewer standard deviations than this."""
+"""Even and odd half frames of one scene differ by fewer standard deviations than this."""
 
 
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open files as one sequence of frames. The form of each file is recognised unless the request states it.
 
-    Raises UsageError, a line per file, for contents that are not a whole number of frames or that fit both forms.
+    Raises UsageError, a line per file, if it cannot be read, holds no whole number of frames, or could have both forms.
     """
     form, rows = asked.form, asked.rows or ROWS
     opened = each_or_problems(files, lambda file: _open_pi_imaging(file, form, rows))
@@ -63,7 +63,7 @@ def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
 
 
 def _open_pi_imaging(file: Path, form: str | None, rows: int) -> tuple[str, NDArray[np.uint8]]:
-    """Find out the form of a file, and return it with the bytes of the frames."""
+    """Find out the form of a file, 'packed' or 'sparse'; return it with the bytes of the frames, without `DONE`."""
     content = bytes_of(file)
     frame_bytes = rows * COLUMNS // 8
     ended = content[-len(DONE) :].tobytes() == DONE
@@ -113,7 +113,7 @@ def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]
 
 def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError, a line per
-    file, for other sizes.
+    file, if it cannot be read or holds no whole number of frames.
     """
     full = asked.form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
@@ -146,7 +146,7 @@ def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
 
 
 def full_frames(raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(n, 512, 64), most significant bit first, from full frames as read out (n, 32768)."""
+    """Frames (n, 512, 64), most significant bit first, from full frames as read out (n, 32768); both uint8."""
     zones = _LSB_FIRST[raw.reshape(-1, HALF_ROWS, _QUARTERS, 2, _ZONE_BYTES)]
     frames = np.empty((len(zones), 2 * HALF_ROWS, _ROW_BYTES), np.uint8)
     halves = frames.reshape(len(zones), 2, HALF_ROWS, _QUARTERS, _ZONE_BYTES)

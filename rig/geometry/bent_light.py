@@ -1,10 +1,10 @@
 """Light that is not one plane within a column: sheets that bow, and rows that are exposed one after the other.
 
 Windows, estimators and the joining of stripes work with planes and rays (u, v, 1). So they use rays that are bent
-sideways by the effect of the bow in the middle of the depth range. The remaining error, together with the delay of the
-rows, is below a pixel or two. The windows are widened by it (`beside_px`), and the depth of a map is corrected
-afterwards, exactly, from each pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has the
-formula of a bowed sheet. Rays are float32 (rows, width), commands and sheets float64.
+sideways: by as much as the bow moves the light in the middle of the depth range. The remaining error, together with the
+delay of the rows, is below a pixel or two. The windows are widened by it (`beside_px`), and the depth of a map is
+computed exactly in the end, from each pixel's command (`BentLight.inverse_depth`). `calibration.model.light_sheet` has
+the formula of a bowed sheet. Arrays are float64, except the rays and depths of `BentLight`, which are float32.
 """
 
 import math
@@ -28,8 +28,8 @@ _SAMPLED_ROWS = 16
 class BentLight:
     """Rays and sheets that turn a map's commands into depth if the light is bent.
 
-    u, v: float32 (rows, width), true rays. commands: (columns,) of the columns' centres. velocity_per_s: of the command
-    during the sweep, negative if it fell. sheets: (samples, 10), the model's sheets as the kernel reads them.
+    u, v: float32 (rows, width), true rays. commands: (columns,), mirror command of each column. sheets: (samples, 10),
+    the model's sheets as `bent_inverse_depth` reads them. velocity_per_s: of the command, negative if it falls.
     """
 
     model: RigModel
@@ -40,7 +40,8 @@ class BentLight:
     velocity_per_s: float = 0.0
 
     def inverse_depth(self, command: Float64, first_row: int = 0) -> Float32:
-        """Inverse depth of pixels (rows, width), from first_row on, that are bound to these commands; NaN stays NaN."""
+        """Inverse depth, float32 (rows, width), of pixels seen at commands (rows, width); NaN where the command is NaN.
+        first_row: row of the picture to which the first row of `command` belongs."""
         from rig.geometry.kernels import bent_inverse_depth
 
         model, rows = self.model, slice(first_row, first_row + len(command))
@@ -72,9 +73,9 @@ def is_bent(model: RigModel) -> bool:
 
 
 def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
-    """The u (rows, width) with which rays meet the planes where, at this depth, the true rays meet the bowed sheets.
+    """The bent rays' u (rows, width): they meet the planes where, at this depth, true rays (u, v, 1) meet the sheets.
 
-    The positions of the planes leave out offset and cone, which change the result by less than the windows' margin.
+    The scanner's offset and cone are left out: they change less than the windows' margin. Without a bow, u itself.
     """
     scanner = model.scanner
     if not isinstance(scanner, PivotScanner) or scanner.bow_per_rad == 0:
@@ -94,8 +95,9 @@ def beside_px(
 ) -> int:
     """Largest distance in pixels of true stripes from those that planes and bent rays give, within the depth range.
 
-    rays: u and v (rows, width); bent: u as from `bent_u`. Rounded up, from a sample of rows and columns. Holds for
-    sweeps in both directions at the fastest speed at which the lag was measured.
+    rays: true u and v (rows, width). bent: u from `bent_u`. commands: (columns,). Rounded up, from a sample of rows and
+    columns. Holds for both directions up to the highest speed at which the lag was measured; if no speed is known, the
+    rows' delay is left out.
     """
     u, v, bent = (each[::_SAMPLED_ROWS] for each in (*rays, bent))
     y = np.arange(0, len(rays[0]), _SAMPLED_ROWS)[:, None]

@@ -1,9 +1,9 @@
 """Compiled geometry: the pixel interval of a depth range on a row, and the depth of pixels on bowed sheets.
 
-`row_windows`: inverse depth w = p.(u, v, 1) is monotone along a row, so both ends of far <= w <= near are found by
-bisection; u, v float32 (rows, width), planes p float64 (columns, 3), ends int32 (rows, columns). `bent_inverse_depth`
-takes Newton's steps, starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64,
-and inverse depth is float32 (rows, width).
+A pixel's ray is (u, v, 1); on a light plane p.X = 1 it has the inverse depth w = p.(u, v, 1) in 1/m. Along a row w is
+monotone, so `row_windows` finds both ends of an interval of w by bisection. `bent_inverse_depth` takes Newton's steps,
+starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64. u, v and inverse
+depth are float32 (rows, width).
 """
 
 from typing import Final
@@ -16,10 +16,10 @@ from rig.simd import Float32, Float64, Int32
 
 @numba.njit(cache=True, nogil=True)
 def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: float) -> tuple[Int32, Int32]:
-    """First and last pixel (rows, columns) int32 whose inverse depth p.(u, v, 1) lies in [w_far, w_near].
+    """First and last pixel of each row whose inverse depth lies in [w_far, w_near], int32 (rows, columns) each.
 
-    Pixels at a row's ends without a ray (NaN) are outside. The interval is empty (first > last) where the plane has no
-    such pixel, and on rows with fewer than two rays.
+    plane: p of each column, (columns, 3). Pixels at a row's ends without a ray (NaN) are outside. The interval is empty
+    (first > last) where the plane has no such pixel, and on rows with fewer than two rays.
     """
     rows, width = u.shape
     columns = plane.shape[0]
@@ -54,8 +54,8 @@ def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: fl
 
 @numba.njit(inline="always")
 def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """First and last pixel of the stretch `first` to `last` of row y without those at its ends that have no ray. At
-    least one pixel is left."""
+    """The pixels `first` to `last` of row y without those at either end that have no ray (NaN): first and last of the
+    rest. At least one pixel is left, even if it has no ray."""
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):
@@ -73,11 +73,11 @@ def bent_inverse_depth(
     command: Float64, ahead: Float64, u: Float32, v: Float32, sheets: Float64, low: float, high: float, origin: Float64,
     bow: float, inverse_depth: Float32,
 ) -> None:  # fmt: skip
-    """Write inverse depth (rows, width) of pixels that are bound to `command`; NaN where there is none.
+    """Write inverse depth (rows, width) of pixels seen at `command` (rows, width); NaN where the command is NaN.
 
-    ahead: (rows,) change of the command until the row is exposed. sheets: (samples, 10) float64, n, d, middle and
-    across of the sheets at even steps of the command from low to high, close enough to be interpolated linearly.
-    origin: (3,) of the sheets' fan in metres. bow: per radian.
+    ahead: (rows,), change of the command from the first row's exposure to each row's. sheets: (samples, 10), n, d, f
+    and t of `light_sheet` at even steps of the command from low to high, close enough to be interpolated linearly.
+    origin: (3,), origin of the sheets' fan in metres. bow: per radian.
     """
     rows, width = command.shape
     per_command = (len(sheets) - 1) / (high - low)

@@ -1,8 +1,9 @@
 """Several lines at once: which column of the map each of them lights at every place of the mirror.
 
-The mirror passes columns / lines places. A frame taken at one of them serves as many columns as there are lines, each
-with its own plane and window. Columns are numbered across the field in the direction of the mirror's sweep, as for a
-single line. Where the lines' parts of the field overlap, their columns interleave.
+A place is the piece of the mirror's path that it crosses during the frames of one column. A sweep has as many places as
+columns divided by lines. A frame taken at a place serves one column of each line, each with its own plane and window.
+Columns are numbered across the field in the direction of the mirror's sweep, as for a single line. Where the lines'
+parts of the field overlap, their columns interleave.
 """
 
 from collections.abc import Sequence
@@ -16,11 +17,10 @@ from rig.simd import Float64, Int32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineGrid:
-    """Line and place of the mirror that light each column of a map.
+    """For each column of a map, the line that lights it, and the place of the mirror at that time.
 
-    offsets: of the lines, in units of the mirror command. step: command from one place of the mirror to the next. line,
-    place: int32 (columns,). overlap: share of a column's window that windows of other lines at the same place cover; 0
-    without a calibration.
+    offsets: of the lines, in units of the mirror command. step: change of the command from one place to the next. line,
+    place: int32 (columns,). overlap: from `window_overlap`; 0 without a calibration.
     """
 
     offsets: tuple[float, ...]
@@ -54,18 +54,18 @@ class LineGrid:
         return result
 
     def bound_commands(self, commands: Float64, column: Float64) -> Float64:
-        """Command (columns,) of each column's line when the column's frames were taken.
+        """Mirror command plus offset of the column's line, (columns,), at which each column's frames were taken.
 
-        commands: of the columns' centres. column: (columns,), the fractional columns to which the frames were bound.
-        Their distances from the columns' own numbers are in places of the mirror.
+        commands: the same at the columns' centres. column: (columns,), the fractional columns to which the frames were
+        bound. Their distances from the columns' own numbers are in places of the mirror.
         """
         result: Float64 = commands + (column - np.arange(len(commands))) * self.step
         return result
 
 
 def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
-    """The grid of a map with `columns` columns, a multiple of the lines, and the commands (columns,) of their
-    centres."""
+    """The grid of a map, and the command plus line offset (columns,) of the columns' centres. `columns` must be a
+    multiple of the number of lines."""
     lines = len(offsets)
     places = columns // lines
     first, last = command_range
@@ -78,12 +78,12 @@ def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float
 
 
 def window_overlap(grid: LineGrid, geometry: SweepGeometry) -> float:
-    """Mean share of a column's search window, on rows where it is visible, that windows of other lines cover."""
+    """Share of the pixels of all search windows that windows of other lines at the same place cover too; 0 if none."""
     columns, covered, whole = grid.columns_at(), 0, 0
     for line in range(grid.lines):
         own, others = columns[:, line], np.delete(columns, line, axis=1)
         lo, hi = geometry.x_lo[:, own], geometry.x_hi[:, own]
-        # The others' windows (rows, places, lines) from left to right, each without what those before it cover.
+        # The others' windows (rows, places, lines - 1) from left to right, each without what those before it cover.
         order = np.argsort(geometry.x_lo[:, others], axis=2)
         los, his = (np.take_along_axis(x[:, others], order, 2) for x in (geometry.x_lo, geometry.x_hi))
         reached = lo.copy()

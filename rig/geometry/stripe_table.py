@@ -1,6 +1,6 @@
 """The stripe table: where the laser line was seen on every row and column, with what certainty, and its errors.
 
-All arrays are (rows, columns). The errors are relative to a truth that a world or a test knows.
+Arrays of stripes are (rows, columns). The errors are relative to a truth that a simulated world or a test knows.
 """
 
 from dataclasses import dataclass, fields
@@ -14,7 +14,8 @@ from rig.simd import Float32, Float64
 class StripeTable:
     """Result of an estimator for one sweep; all arrays float32 (rows, columns).
 
-    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where the row has no data.
+    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where a column has no frames or a row
+    has no search window for it.
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN); that of `argmax` and
     `edge` takes no account of haze.
     x_sd_px: standard deviation of x_px given that it is the right stripe.
@@ -49,10 +50,10 @@ MISSING_PX = 10.0
 
 
 def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
-    """Errors in pixels over the (row, column) that have a true stripe; both arrays (rows, columns), NaN = none.
+    """Errors in pixels at each (row, column) with a true stripe; both arrays (rows, columns), NaN where there is none.
 
-    `missing`: share of those without an estimate; `mean_abs`, `median_abs`: over the estimated ones (None if there are
-    none); `within_1px`: share of all, where a missing one counts as wrong. All None if there is no true stripe.
+    `missing`: share of true stripes without an estimate. `mean_abs`, `median_abs`: of those with an estimate; None if
+    there are none. `within_1px`: share of all; a missing one counts as wrong. All are None if there is no true stripe.
     """
     scored = np.isfinite(true_x_px)
     error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])
@@ -73,7 +74,7 @@ def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
 
 
 def depth_errors(depth_m: Float32, true_depth_m: Float32) -> dict[str, float | None]:
-    """Mean and median absolute depth error in metres over pixels that have both depths; None if no pixel has."""
+    """Mean and median absolute depth error in metres over the pixels that have both depths; None if there are none."""
     error = np.abs(depth_m.astype(np.float64) - true_depth_m)
     return _sizes(error[np.isfinite(error)])
 

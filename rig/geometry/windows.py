@@ -22,7 +22,7 @@ WORD_PX: Final = 64
 MARGIN_PX = 10
 """Pixels kept on both sides of the search interval, since they show where the haze ends."""
 _GOLDEN: Final = 0.6180339887
-"""Fraction of the golden ratio, whose multiples cover rows and columns without beating against either."""
+"""Fractional part of the golden ratio. Its multiples cover rows and columns without beating against either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,8 @@ class SweepGeometry:
         return (self.u, self.v) if self.light is None else (self.light.u, self.light.v)
 
     def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
-        """This geometry with the light of a sweep whose columns were bound to `commands`, at this velocity."""
+        """This geometry with the light of a sweep whose columns were taken at `commands` (columns,), with the command
+        moving at this velocity. The windows stay."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
         return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)
@@ -102,7 +103,7 @@ class SweepGeometry:
 
 
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
-    """Search windows of the light at mirror commands (columns,), for a camera and a depth range in metres.
+    """Rays, planes and search windows of a sweep. commands: (columns,), of the mirror. depth_range_m: near and far end.
 
     Raises UsageError if a plane passes through the camera, or if no column can be seen within the depth range, and
     CalibrationError for commands outside the calibration's.

@@ -44,7 +44,7 @@ def model_problems(
 
 
 def require_speed(model: RigModel, speed_per_s: float, exposures: int) -> None:
-    """Raise CalibrationError if the lag was not measured near this speed. The message has a command that measures it.
+    """Raise CalibrationError if the lag was measured, but not near this speed. The message has a command to measure it.
 
     The speed of a sweep is inversely proportional to its exposures. The command names this scan's exposures, and those
     that give the speed at the far end of the range measured so far, so that scans that were possible stay possible.
@@ -67,11 +67,11 @@ def whole_rows(plan: ScanPlan) -> ScanPlan:
 
 
 def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
-    """The plan with the lag and the windows of `model`; unchanged if it was compiled for that model.
+    """The plan with the lag and the windows of `model`; an equal plan if it was compiled for that model.
 
     Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. Frames that do not contain a
     column's window do not count for that column. Raises UsageError if the calibration does not fit the plan's sensor,
-    speed or commands.
+    speed, commands or depth range.
     """
     try:
         model.check_sensor(plan.width, plan.rows)

@@ -29,10 +29,8 @@ CLOCK_TOLERANCE = 2e-4
 GUARD_FRAMES = 1.0
 """Frames by which the gate opens before the first and closes after the last column, to light their frames wholly."""
 BLOCK_S = 5e-3
-"""Seconds that the frames of a block span.
-
-Each block costs Python some 0.3 ms, part of it on every thread; an estimate waits for its block to fill.
-"""
+"""Seconds that the frames of a block span. Each block costs Python some 0.3 ms, part of it on every thread; an estimate
+waits for its block to fill."""
 BLOCK_BYTES = 16 << 20
 """Most bytes of a block's frames with their records: 511 whole frames of 512 x 512 pixels."""
 

@@ -115,7 +115,7 @@ def beyond_sensor(scan: ScanConfig, info: SpadInfo) -> Iterator[tuple[float, str
 def beyond_link(plan: ScanPlan, info: SpadInfo, draft_at: Callable[[Fraction], ScanPlan | None]) -> tuple[float, str]:
     """Highest frame rate that the link carries, in whole hertz (0: none), and the problem with the requested one.
 
-    draft_at: makes the plan at another frame rate; None if there is none.
+    draft_at: makes the plan at another frame rate; returns None if there is none.
     """
     rate, have = float(plan.frame_rate_hz), plan.link_bytes_per_s or 0.0
     made = f"{digits(rate * frame_bytes(plan.width, plan.rows) / 1e6, 4)} MB/s of full frames"

@@ -158,9 +158,7 @@ def sweep_path(
 
 
 def mirrored(path: SweepPath) -> SweepPath:
-    """The way back: the path reflected so that it begins where `path` ends and ends where it begins, with the same
-    timing.
-    """
+    """The way back: the path reflected, so that it begins where `path` ends and ends where it begins; equal timing."""
     total = path.low + path.high
     segments = tuple(
         PathSegment(s.kind, s.start_point, s.points, total - s.start, -s.v0, -s.v1, -s.distance) for s in path.segments
@@ -181,7 +179,7 @@ MOST_EXPOSURES = 65535
 class PathDemand:
     """The demand of a scan on the mirror.
 
-    edges: commands of the lit part's two ends.
+    edges: commands of the lit part's two ends. columns: of one line.
     column_s, frame_s: exact seconds of a column and of a frame.
     lag_s: longest lag of the mirror.
     guard_s: extra time that the gate is open on either side. clock_tolerance: relative error of the gate's clock.
@@ -212,9 +210,7 @@ class PathDemand:
 
     @property
     def gate_margin_s(self) -> float:
-        """Time for which the gate is open before the first and after the last column: `guard_s`, and the drift of the
-        gate's clock.
-        """
+        """Time for which the gate is open beyond each end of the lit part: `guard_s`, and the drift of its clock."""
         # The drift counts from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
 
@@ -226,7 +222,7 @@ class PathDemand:
 
 @dataclass(frozen=True, slots=True)
 class PathFound:
-    """A path and its point clock. If no path is possible, it is None and `problems` say why, without remedies."""
+    """A path and its point clock. If no path is possible, `path` is None and `problems` say why, without remedies."""
 
     path: SweepPath | None
     rate_hz: Fraction

@@ -35,8 +35,7 @@ Shifted against itself, or against its reverse, it correlates to at most 0.36; i
 MAX_CLOCK_ERROR = 1e-3
 """Clock ratios further from nominal than this are a fault, not a crystal."""
 CHIPS_PER_COLUMN = 5
-"""Approximate length of a column in chips: the longer a chip, the fewer photons per frame it takes to find the pattern.
-"""
+"""Approximate length of a column in chips. With longer chips, fewer photons per frame suffice to find the pattern."""
 MOST_CHIP_FRAMES = 8
 VERNIER_FRAMES = 0.382
 """Part of a frame added to a chip's whole frames: 1 - 0.618 (golden ratio). Multiples of it spread most evenly."""
@@ -48,8 +47,8 @@ MARGIN_FRAMES = 2.0
 class Blanking:
     """The blanking pattern of a plan.
 
-    chip_s: length of a chip. guard_s: dark time between pattern and lit part. tolerance_s: how far the pattern may lie
-    from its planned time.
+    chip_s: length of a chip. guard_s: dark time between the pattern and the opening of the gate for the lit part.
+    tolerance_s: how far the pattern may lie from its planned time.
     """
 
     chip_s: float
@@ -67,7 +66,8 @@ class Blanking:
         return self.length_s + self.guard_s
 
     def flashes_s(self, leg: int) -> tuple[tuple[float, float], ...]:
-        """(open, close) of each flash, from the pattern's first edge. On the way back the code is reversed."""
+        """(open, close) of each flash in seconds from the pattern's first edge. leg: 0, or 1 on the way back, where the
+        code is reversed."""
         code = CODE[::-1] if leg % 2 else CODE
         edges = [i for i in range(len(code) + 1) if (code[i - 1 : i] or "0") != (code[i : i + 1] or "0")]
         return tuple((a * self.chip_s, b * self.chip_s) for a, b in zip(edges[::2], edges[1::2], strict=True))
@@ -169,8 +169,7 @@ class ScanPlan:
 
     @property
     def frames_per_sweep(self) -> Fraction:
-        """Number of frames from one scan marker to the next; rarely an integer, since the two clocks are
-        independent."""
+        """Number of frames from one scan marker to the next; rarely an integer, as the two clocks are independent."""
         return self.sweep_s * self.frame_rate_hz
 
     @property
@@ -221,9 +220,7 @@ class ScanPlan:
 
     @property
     def windows_hz(self) -> float | None:
-        """Highest frame rate at which the link can carry this plan's windows, Hz; None if there are no windows or no
-        stream.
-        """
+        """Highest frame rate at which the link can carry this plan's windows, Hz; None without windows or stream."""
         if self.windows is None or self.link_bytes_per_s is None:
             return None
         return self.link_bytes_per_s / frame_bytes(self.windows.width_px, self.rows)
@@ -261,8 +258,8 @@ class ScanPlan:
         return float(leg.path.lit_start / self.point_rate_hz) + leg.lag_s
 
     def column(self, tau_s: Array, leg: Leg) -> Array:
-        """Fractional column (with several lines: place) of the mirror `tau_s` after the scan marker of a sweep of a
-        leg.
+        """Fractional column (with several lines: place, see `LineGrid`) of the mirror `tau_s` seconds after the scan
+        marker of a sweep of this leg.
 
         Continued linearly outside the lit part (below -0.5, above places - 0.5), where the mirror is on no column.
         """
@@ -270,8 +267,8 @@ class ScanPlan:
         return done - 0.5 if leg.columns_rise else self.places - 0.5 - done
 
     def column_time_s(self, column: Array, direction: int, first_frame: int) -> Array:
-        """Seconds from the SPAD's start until the mirror passes fractional places (n,) in a sweep of a direction that
-        begins with frame `first_frame`.
+        """Seconds (columns,) from the SPAD's start until the mirror passes fractional columns, in a sweep that begins
+        with frame `first_frame`. With several lines the times are those of the places' centres, whatever `column` is.
         """
         leg = next(leg for leg in self.legs if leg.direction == direction)
         place = np.asarray(column if self.lines is None else self.lines.place, np.float64)
@@ -280,7 +277,7 @@ class ScanPlan:
         return passed
 
     def command_at(self, column: Array) -> Array:
-        """Mirror command of fractional places, of any shape; NaN stays NaN."""
+        """Mirror command of fractional columns (with several lines: places), of any shape; NaN stays NaN."""
         return column_command(column, self.command_range, self.places)
 
     def line_commands(self, column: Array) -> Array:
@@ -294,9 +291,7 @@ class ScanPlan:
         return 0 if self.blanking is None else len(self.legs)
 
     def pattern_s(self, leg: Leg) -> float:
-        """Seconds from the scan marker of a sweep of this leg until the blanking pattern begins; without a pattern,
-        until the gate opens.
-        """
+        """Seconds from a sweep's scan marker until the blanking pattern begins; without one, until the gate opens."""
         return leg.gate_open_s - (0.0 if self.blanking is None else self.blanking.lead_s)
 
     def frames_for(self, maps: int) -> float:

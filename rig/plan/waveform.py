@@ -1,7 +1,7 @@
 """The scanner's waveform: commands and markers of every point, the times when the gate opens, and the SPAD's windows.
 
-`waveform_of` makes commands and markers. `moving_windows` makes the table of windows that a scan needs of its SPAD,
-with the pixels of a row from one line marker to the next.
+`waveform_of` makes commands and markers. `moving_windows` makes the SPAD's table of windows: which pixels of a row are
+used from one line marker to the next.
 
 A frame is bound to the column in the middle of its exposure. So an entry of the table holds the pixels of every column
 that the mirror, including its lag, passes between one marker and the next, and during the frame into which a marker
@@ -101,8 +101,7 @@ def moving_windows(plan: ScanPlan, step_px: int) -> tuple[WindowTable, NDArray[n
 
 
 def window_widths(plan: ScanPlan, step_px: int) -> tuple[int, int, int]:
-    """Narrowest and widest (a whole row, in words) possible width of a window, and the step between widths, in
-    pixels."""
+    """Narrowest and widest possible window (the widest is a whole padded row), and the step between widths, pixels."""
     grid = math.lcm(step_px, WORD_PX)
     return grid, -(-plan.width // WORD_PX) * WORD_PX, grid
 

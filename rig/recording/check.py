@@ -1,8 +1,8 @@
 """Reads every byte of a recording and finds which blocks are sound, what is damaged, and whether frames are missing.
 
-`check_segments` finds the sound blocks, `Continuity` the gaps between them, which show in the blocks' numbers. Gaps at
-the ends of a start do not show in its blocks: `lost_ends` finds them in the index and the manifest. In names of this
-package, `run` is one start of the SPAD; its run id is in every block.
+`check_segments` finds the sound blocks. `Continuity` finds gaps before and between them by their numbers. A gap
+at the end of a start, or at the beginning of a cut part, does not show there: `lost_ends` finds it in the index and
+the manifest. A `run` is here one start of the SPAD (frames without a pause), whose run id is in every block.
 """
 
 import zlib
@@ -33,16 +33,16 @@ _CLOCK_SHARE: Final = 0.01
 _NEIGHBOURS: Final = 2
 """Number of blocks before a block, and after it, with which it is compared."""
 _FEW: Final = 4
-"""At most one in this many blocks of a start is left out because of its ticks or sweep; of three blocks, one."""
+"""At most one in this many blocks of a start is left out because of its ticks or sweep (one if there are three)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
     """A block with correct checksums. Only the checksum of the pixels may be missing (see `objection`).
 
-    entry: its index record. first_tick, last_tick: of its frames; 0 if it has none. last_sweep: number of scan markers
-    up to its last frame. repeated: (first, last) numbers of frames whose ticks do not rise; they count as lost.
-    objection: why the block cannot be what was recorded; None if it can.
+    entry: its index record. first_tick, last_tick: of its first and last frame; 0 if it has none. last_sweep: number of
+    scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose ticks do not rise; they
+    count as missing. objection: why the block cannot be what was recorded; None if it can.
     """
 
     entry: bytes
@@ -102,8 +102,8 @@ class Continuity:
     """Gaps and problems between the blocks of a recording.
 
     known: gaps that a repair found and noted; None if there was no repair.
-    gaps: frames that the recording says are lost, because the device lost them or a repair found them missing.
-    missing: frames that are missing although the recording does not say so.
+    gaps: those that the recording tells of, because the device lost the frames or a repair noted them as missing.
+    missing: those that the recording does not tell of.
     """
 
     known: Collection[RunGap] | None
@@ -119,7 +119,7 @@ class Continuity:
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
         """Note the gaps before and between the blocks of a start, and what is wrong with their numbers and ticks.
 
-        is_part: whether the recording was cut from another one, so that it need not begin with the first block.
+        number: of the start. is_part: whether the recording was cut from another one, so that it may begin anywhere.
         """
         first = run[0]
         self.gaps += [
@@ -138,7 +138,7 @@ class Continuity:
                 self._repeat(number, *frames, f"within block {block.block_seq}")
 
     def _repeat(self, number: int, first: int, last: int, where: str) -> None:
-        """Count as lost the frames whose ticks do not rise, although they are there."""
+        """Count frames whose ticks do not rise as a known gap or as missing, although they are there."""
         gap = number, first, last
         if gap in (self.known or ()):
             self.gaps.append(gap)
@@ -147,9 +147,9 @@ class Continuity:
             self.problems.append(f"run {number}: the clock goes back {where}")
 
     def _join(self, number: int, before: tuple[int, int, int], block: SoundBlock) -> None:
-        """Check whether `block` can follow `before`: (end of the frames, frames lost by then, number of the block).
+        """Check whether `block` can follow a block. before: (end of its frames, frames lost before it, its number).
 
-        Gaps that a repair found take the place of the device's counts, which may belong to blocks that are gone.
+        After a repair, counts of the device that do not fit are no problem: they may be of blocks that are gone.
         """
         end_frame, lost_before, block_seq = before
         missing, lost = block.first_frame - end_frame, block.header.lost_before - lost_before
@@ -173,7 +173,7 @@ class Continuity:
 
 
 def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
-    """Whether frames whose numbers differ by `frames` can be `ticks` apart; always true without a frame period."""
+    """Whether frames whose numbers differ by `frames` can be `ticks` apart; True for frames triggered from outside."""
     period = header.frame_period_ticks
     return not period or abs(ticks - frames * period) <= period * (0.5 + _CLOCK_SHARE * abs(frames))
 
@@ -181,7 +181,7 @@ def in_step(frames: int, ticks: int, header: BlockHeader) -> bool:
 def out_of_step(run: Run) -> list[SoundBlock]:
     """Blocks of a start whose ticks or sweep disagree with their frame numbers, judged by their neighbours.
 
-    Empty if more than a few disagree, since the device then counts in another way. Empty too with at most two blocks.
+    Empty for one or two blocks, and if more than one in `_FEW` disagree, since the device then counts in another way.
     """
     votes = [0] * len(run)
     for i, block in enumerate(run):
@@ -233,7 +233,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
-    """Reason why a block with all its checksums cannot be what was recorded; None if it can."""
+    """Reason why a block without a wrong checksum cannot be what was recorded; None if it can."""
     end = placed.offset + placed.length
     if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # 0: no CRC, or a CRC of 0
         payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
@@ -249,10 +249,10 @@ def _objection(segment: SegmentReader, placed: Placed) -> str | None:
 def lost_ends(
     contents: Contents, runs: Sequence[Run], joined: Continuity, manifest: dict[str, Any] | None
 ) -> list[RunGap]:
-    """Frames that are missing at the end of each start and, in a part that was cut, at its beginning.
+    """Frames that are missing at the end of each start and, in a cut part, at its beginning.
 
-    They show in index records of missing blocks, in the range of frames of a part, and in the number of frames that the
-    device delivered. Starts of which nothing is left get the numbers after those of `runs`.
+    They show in index records of missing blocks, in the range of frames that the manifest of a part states, and in the
+    number of frames that the device delivered. Starts of which nothing is left get the numbers after those of `runs`.
     """
     cut = (manifest or {}).get("cut")
     ranges = _told_ranges(contents, runs)
@@ -273,8 +273,8 @@ def lost_ends(
 
 
 def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int, int]]:
-    """First and end frame by run id, from index records beyond the ends of a start, or of a start of which nothing is
-    left. Empty if the index names fewer than half of the sound blocks."""
+    """(first frame, last + 1) by run id, of index records beyond the ends of a start, or of a start of which nothing
+    is left. Empty if the index names fewer than half of the sound blocks."""
     sound = {block.entry for run in runs for block in run}
     if len(contents.told) == 0 or 2 * sum(entry.tobytes() in sound for entry in contents.told) < len(sound):
         return {}
@@ -290,7 +290,7 @@ def _told_ranges(contents: Contents, runs: Sequence[Run]) -> dict[int, tuple[int
 
 
 def _extend(ranges: dict[int, tuple[int, int]], run_id: int, first: int, end: int) -> None:
-    """Extend the range of a start's frames to these."""
+    """Extend the range of a start's frames so that it includes first to end - 1."""
     began, ended = ranges.get(run_id, (first, end))
     ranges[run_id] = min(began, first), max(ended, end)
 
@@ -310,7 +310,7 @@ def _reaches_beyond(entry: Any, run: Run) -> bool:
 
 
 def _delivered_behind(runs: Sequence[Run], missing: Sequence[RunGap], manifest: dict[str, Any] | None) -> list[RunGap]:
-    """Frames after the end of the last start that the device delivered and that nothing else mentions."""
+    """The gap after the last start's end, if the device delivered more frames than are there or known as missing."""
     if manifest is None or not runs or ended_early(manifest) is not None:
         return []
     delivered = device_counters(manifest)[0].get("delivered", 0)

@@ -1,6 +1,6 @@
 """Compresses a finished recording, each block by itself, so that any block can be read alone.
 
-`frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. Each segment is replaced only once the
+`frames-000000.spb` becomes `frames-000000.spb.zst`; the index stays as it is. A segment is removed only once the
 compressed one is on the disk and unpacks to the same bytes.
 """
 
@@ -34,7 +34,7 @@ LEVEL: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Compression:
-    """Result of a compression: number of segments, and bytes of all of them unpacked and compressed."""
+    """Result of a compression: number of segments, and the bytes of all of them, plain and compressed."""
 
     segments: int
     bytes_before: int
@@ -43,8 +43,6 @@ class Compression:
 
 def compress(run: PathLike) -> Compression:
     """Compress a recording with zstd; it can be read like any other (`rig compress`). Needs the extra `compress`.
-
-    Segments that are compressed already stay as they are.
 
     Raises UsageError if there is no recording or the package zstandard is missing, DamagedRecordingError if the
     recording is damaged or its run not over, and RecordingError if a segment cannot be written or does not unpack to

@@ -31,17 +31,17 @@ from rig.recording.open import open_recording
 CHUNK_BYTES = 16 << 20
 """Bytes of the pieces that frames are read in."""
 RATE_TOLERANCE: Final = 1e-3
-"""Relative tolerance of frame rates, which are written with three digits or so."""
+"""Relative difference between the frame rates of plan and recording that is allowed for rounded numbers."""
 
 Piece = tuple[int, NDArray[np.uint8]]
-"""Number of the first frame, and uint8 (n, height, ceil(width/8) or more) of this frame and those that follow it."""
+"""Number of the first frame, and uint8 (n, height, ceil(width / 8) or more) of this frame and the next n - 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cube:
-    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole sweeps.
+    """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole maps.
 
-    between: called with (first, end, step), yields those of the frames first..end-1 that exist, at most step at a time.
+    between: called with (first, end, step), yields those of frames first to end - 1 that exist, at most step at a time.
     """
 
     path: Path
@@ -54,7 +54,7 @@ class Cube:
 
     @property
     def frames_per_map(self) -> int:
-        """Number of frames of one sweep, including lost ones."""
+        """Number of frames of one map, including lost ones."""
         return self.plan.columns * self.plan.exposures
 
 
@@ -84,14 +84,14 @@ def _in_array(array: NDArray[np.uint8], first: int, end: int, step: int) -> Iter
 
 
 def _recorded(recording: RunRecording, run: RecordedRun, first: int, end: int, step: int) -> Iterator[Piece]:
-    """Frames by their own numbers, without those of damaged blocks."""
+    """`Cube.between` for a recording: frames of damaged blocks are left out."""
     for block in recording.blocks(run, first, end):
         for start in range(0, block.n_frames, step):
             yield block.header.first_frame + start, block.bits[start : start + step]
 
 
 def cube_columns(model: RigModel) -> int | None:
-    """Number of columns of the cube for which a model with `planes` was made; None if its commands are a mirror's."""
+    """Columns of the cube for which a model with `planes` was made; None if the model's commands are a mirror's."""
     scanner = model.scanner
     if isinstance(scanner, PlaneTable) and np.array_equal(scanner.command, np.arange(len(scanner.command))):
         return len(scanner.command)
@@ -99,14 +99,12 @@ def cube_columns(model: RigModel) -> int | None:
 
 
 def column_commands(plan: CubePlan) -> NDArray[np.float64]:
-    """Commands of a cube's columns. They are the column numbers, at which the `planes` of its calibration are
-    sampled."""
+    """Commands of a cube's columns, float64 (columns,): their numbers, which index the calibration's `planes`."""
     return np.arange(plan.columns, dtype=np.float64)
 
 
 def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, list[Gap]]:
-    """Count one map with a counter made for the cube's columns and size; returns the counts and the gaps in its
-    frames."""
+    """Count one map; returns its counts and the gaps in its frames. counter: made for the cube's columns and size."""
     counter.reset()
     first = cube.first_frame + index * cube.frames_per_map
     end = first + cube.frames_per_map
@@ -211,7 +209,7 @@ _UNREADABLE: Final = (ValueError, EOFError, SyntaxError, OverflowError, MemoryEr
 
 
 def open_array(file: Path) -> NDArray[Any]:
-    """The array of a `.npy` file, mapped into memory. Raises UsageError, with one line, if it holds none."""
+    """The array of a `.npy` file, mapped into memory. Raises UsageError, with one line, if it cannot be read."""
     try:
         if zipfile.is_zipfile(file):
             raise UsageError(f"{file} is an archive of arrays; a cube is one array, written with numpy.save")
@@ -242,7 +240,7 @@ def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
 
 
 def _numpy_line(frames: NDArray[Any], height: int, width: int) -> str | None:
-    """The line of numpy that makes uint8 (frames, height, ceil(width / 8)) of an array; None if its size cannot fit."""
+    """The line of numpy code that makes an array a cube (uint8, packed); None if its shape or dtype cannot fit."""
     packed, whole, dtype = (height, -(-width // 8)), (height, width), frames.dtype
     line, shape = "frames", frames.shape
     if shape in (packed, whole):

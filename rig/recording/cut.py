@@ -26,14 +26,15 @@ from rig.run_folder.manifest import MANIFEST, UNFINISHED, known_missing, manifes
 from rig.run_folder.summary import RunVerdict
 
 OF_MAPS: Final = ("learned", "truth")
-"""Folders with a file for each map, which are copied to the part."""
+"""Folders with files of single maps, which are copied to the part."""
 _VERDICT_WITHOUT_GAPS: Final = {RunVerdict.GAPS: RunVerdict.COMPLETE, UNFINISHED: RunVerdict.ABORTED}
-"""Verdict of a part without gaps, by the verdict of the whole. A part is over even if the run is not."""
+"""Verdict of a part without gaps, by the verdict of the whole, where it differs. No part is still being recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Frames of one start. The maps completely in it are first_map to end_map - 1 of the recording; 0, 0 for none."""
+    """Frames first_frame to end_frame - 1 of a start. The recording's maps first_map to end_map - 1 lie completely in
+    them; 0 and 0 if none does."""
 
     run: RecordedRun
     first_frame: int
@@ -47,9 +48,8 @@ def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **chang
 
     request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. In
       a range `A:B`, A may be left out for the first, B for the end; a single number means one map or frame.
-
-    Raises UsageError for a part that does not exist or an `out` that cannot be written, DamagedRecordingError if the
-    recording is damaged, RecordingError if the disk is full.
+    Raises UsageError for a part that does not exist or an `out` that cannot be used, DamagedRecordingError if the
+    recording is damaged, RecordingError if frames or other files of the part cannot be written.
     """
     folder, asked = Path(run), replace(request or CutRequest(), **changes)
     recording = open_recording(folder)
@@ -109,7 +109,7 @@ def _parts(recording: RunRecording, spans: Sequence[MapSpan], asked: CutRequest)
 
 
 def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, end: int) -> list[Part]:
-    """One part for each start that has some of the maps, up to the frame whose marker closes the last of them."""
+    """For each start with some of the maps: its part, up to and with the frame whose marker ends the last of them."""
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
             f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "
@@ -149,7 +149,7 @@ def _time_range(text: str, of: RecordedRun) -> tuple[int, int]:
 def _manifest(
     manifest: dict[str, Any], parts: Sequence[Part], recording: dict[str, object], lost: list[list[int]]
 ) -> dict[str, Any]:
-    """The manifest of the whole recording, with the part's frames, maps and verdict."""
+    """The manifest of the part: that of the whole recording, with the part's frames, maps and verdict."""
     first_map, end_map = parts[0].first_map, parts[-1].end_map
     sweeps, verdict = manifest.get("sweeps"), manifest.get("verdict", UNFINISHED)
     content = {
@@ -185,7 +185,7 @@ def _manifest(
 
 
 def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
-    """Ratio of the clocks with which the first map of a part was bound: the last one fitted before it in its start."""
+    """Ratio of the scanner's clock to nominal for binding a part's first map: the last one fitted before it."""
     sweeps = manifest.get("sweeps") or []
     known = (manifest.get("cut") or {}).get("clock_ratios") or []
     ratio = float(known[part.run.number]) if part.run.number < len(known) else 1.0
@@ -193,7 +193,7 @@ def _clock_ratio(manifest: dict[str, Any], part: Part, is_first: bool) -> float:
 
 
 def _copy_inputs(folder: Path, out: Path, manifest: dict[str, Any], parts: Sequence[Part]) -> None:
-    """Copy the files beside the frames; files of maps are numbered from 0 again, as the part's maps are."""
+    """Copy the files beside the frames. Files of maps get the part's numbers, which begin with 0. Raises OSError."""
     for name in manifest.get("inputs") or {}:
         shutil.copyfile(folder / name, out / name)
     for kind in OF_MAPS:

@@ -1,5 +1,5 @@
-"""Plan and calibration beside the frames of a recording, without which frames cannot be interpreted, and the state that
-its estimator began with.
+"""Files beside the frames of a recording: plan and calibration, without which frames cannot be interpreted, and the
+state of an earlier run with which the estimator began.
 
 `to_plain` and `from_plain` turn dataclasses into plain values for YAML and JSON and back, exactly: fractions become
 text ("100000/3"), arrays their dtype and values. Fields that a dataclass computes itself (init=False) are left out.
@@ -40,8 +40,8 @@ MOST_PIXELS: Final = 0xFFFF
 
 
 def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None, learned: RowModel | None = None) -> None:
-    """Write the compiled plan with every number, the calibration if there is one, and the state `learned` in an earlier
-    run if the scan begins with it. Raises OSError.
+    """Write the compiled plan with every number, the calibration `model`, and the state `learned` in an earlier run,
+    with which the scan begins; the last two may be None. Raises OSError.
     """
     content = {"format": PLAN_FORMAT, "version": PLAN_VERSION, "plan": to_plain(plan)}
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -54,8 +54,8 @@ def write_inputs(folder: Path, plan: ScanPlan, model: RigModel | None, learned: 
 
 
 def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
-    """Read the plan with which a recording was taken. Raises UsageError if there is none that this program reads, and
-    without a file also what `holds_frames_alone` raises."""
+    """Read the plan with which a recording was taken. Raises UsageError if it is missing or not valid and, if it is
+    missing, also what `holds_frames_alone` raises."""
     file = folder / name
     try:
         content = load_yaml(file, "a plan", f"format: {PLAN_FORMAT}").content
@@ -84,7 +84,7 @@ def read_plan(folder: Path, name: str = PLAN_FILE) -> ScanPlan:
 
 
 def _require_sizes(plan: ScanPlan) -> None:
-    """Raise ValueError for numbers of a plan that do not fit its arrays, or that a block cannot hold."""
+    """Raise ValueError if numbers and arrays of a plan contradict each other, or a block cannot hold them."""
     row = -(-plan.width // WORD_PX) * WORD_PX
     points = (plan.sweep_points * len(plan.legs),)
     blanking = plan.blanking or Blanking(0.0, 0.0, 0.0)
@@ -117,8 +117,8 @@ def _require_sizes(plan: ScanPlan) -> None:
 
 
 def holds_frames_alone(folder: Path) -> bool:
-    """Whether a recording has no plan and never had one, as with imported frames: neither its manifest names a plan nor
-    its frames have markers.
+    """Whether a recording has no plan and never had one, like imported frames: its manifest names none, and its frames
+    have no markers.
 
     Raises UsageError if there is no recording, DamagedRecordingError if the manifest or every block is damaged.
     """
@@ -128,7 +128,7 @@ def holds_frames_alone(folder: Path) -> bool:
 
 
 def reconstruct_line(folder: Path) -> str:
-    """The command that makes depth from a recording, with options for the files that are missing beside its frames."""
+    """The command that makes depth from a recording, with options for the files that its folder lacks."""
     plan = " --plan PLAN" if holds_frames_alone(folder) else ""
     calibration = "" if (folder / CALIBRATION_FILE).exists() else " --calibration CALIBRATION"
     return f"rig reconstruct {folder}{plan}{calibration} --out DIR"
@@ -149,12 +149,11 @@ def read_model(folder: Path) -> RigModel | None:
 T = TypeVar("T")
 _FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
 SINCE = "since"
-"""Key in the metadata of a field that the first recordings did not have; its default is None."""
+"""Key in the metadata of a field that the first recordings did not have. The default of such a field is None."""
 
 
 def to_plain(value: Any) -> Any:
-    """The value as numbers, text, lists and mappings that `from_plain` reads. Raises TypeError if it has no
-    such form."""
+    """The value as numbers, text, lists and mappings, for `from_plain`. Raises TypeError if it has no such form."""
     if is_dataclass(value):
         kept = [(field, getattr(value, field.name)) for field in fields(value) if field.init]
         return {field.name: to_plain(one) for field, one in kept if one is not None or SINCE not in field.metadata}

@@ -26,7 +26,7 @@ SEGMENTS: Final = "frames-*.spb"
 
 
 def open_recording(folder: Path) -> RunRecording:
-    """Open the recording of a run. Raises UsageError without one, DamagedRecordingError if no block can be read."""
+    """Open a run's recording. Raises UsageError if there is none, DamagedRecordingError if no block can be read."""
     require_recording(folder)
     try:
         return RunRecording(folder)
@@ -37,7 +37,7 @@ def open_recording(folder: Path) -> RunRecording:
 
 
 def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is no folder with a recording, or if that is compressed and zstandard is missing."""
+    """Raise UsageError if a path is no folder with a recording, or zstandard is missing for a compressed one."""
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:
         raise UsageError(f"{path} {_instead(path)}")
@@ -49,7 +49,7 @@ def require_recording(path: Path) -> None:
 
 
 def _instead(path: Path) -> str:
-    """Say what a path without a recording is, and the next step."""
+    """Say what a path without a recording is, and what to do next."""
     name_one = "name the folder of a run taken with --record"
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
@@ -80,7 +80,7 @@ def _instead(path: Path) -> str:
 
 
 def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
-    """The manifest and None, or None and the reason why there is no manifest."""
+    """(manifest, None), or (None, the reason) if it is missing or damaged."""
     try:
         manifest = read_manifest(folder)
     except DamagedRecordingError as error:
@@ -90,7 +90,7 @@ def manifest_or_none(folder: Path) -> tuple[dict[str, Any] | None, str | None]:
 
 @dataclass(frozen=True, slots=True)
 class MapSpan:
-    """Frames of a map, all of one start (`run`): from the frame with its scan marker to just before the next marker."""
+    """Frames first_frame to end_frame - 1 of a map, from its scan marker to the next. run: number of the start."""
 
     run: int
     first_frame: int
@@ -98,7 +98,7 @@ class MapSpan:
 
 
 def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[MapSpan]:
-    """Find the whole maps of a recording, in order."""
+    """The frames of the whole maps of a recording, in order."""
     manifest = manifest or {}
     sweeps = manifest.get("sweeps")
     if sweeps is None:
@@ -113,7 +113,7 @@ def map_spans(recording: RunRecording, manifest: dict[str, Any] | None) -> list[
 
 
 def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[MapSpan]:
-    """Spans as the manifest states them; frame numbers begin anew with each start."""
+    """Spans of the starts that are there, as the manifest states them. Frame numbers begin anew with each start."""
     run, end = 0, 0
     for sweep in sweeps:
         first = int(sweep["first_frame"])
@@ -125,13 +125,13 @@ def _stated(recording: RunRecording, sweeps: list[dict[str, Any]]) -> Iterator[M
 
 
 def _marked(recording: RunRecording) -> Iterator[MapSpan]:
-    """Spans between markers; a map whose beginning or end was lost has the frames that are left."""
+    """Spans between markers. If a map's first or last frames were lost, its span covers those that are left."""
     for run in recording.runs:
         yield from (MapSpan(run.number, a, b) for a, b in pairwise(_sweep_begins(recording, run)))
 
 
 def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
-    """Numbers of a start's frames with a scan marker; if such a frame was lost, that of the first one after it."""
+    """Numbers of a start's frames with a scan marker. For a lost one: the number of the first frame after it."""
     entries = run.entries
     changes = np.flatnonzero(np.diff(entries["sweep"].astype(np.int64), prepend=-1) != 0)
     look_into = sorted({0, len(entries) - 1, *changes.tolist(), *(changes[1:] - 1).tolist()})
@@ -147,13 +147,13 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Number of scan markers in the start up to each frame: the record's low 16 bits, extended with the header's 32."""
+    """Scan markers of the start up to each frame, int64 (n,): 16 bits of its record, extended with the header's 32."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
 
 def begins_sweep(block: FrameBlock) -> bool:
-    """Whether the first frame of a block has a scan marker itself."""
+    """Whether the first frame of a block has a scan marker. The block must not be empty."""
     return bool(int(block.records["marks"][0]) & Mark.SCAN)
 
 
@@ -161,9 +161,9 @@ def begins_sweep(block: FrameBlock) -> bool:
 class RunInfo:
     """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1 (None: none).
 
-    gaps: number of missing pieces between its frames and, if a repair found some, at its ends. lost: frames in these.
-    width, height: pixels of a frame. frame_rate_hz: None without a frame period. duration_s: from the first frame to
-    the end of the last one; without a frame period, to the last block's start.
+    frames: number recorded. gaps: number of stretches missing between these and, if a repair found some, at the ends.
+    lost: number of frames in the gaps. width, height: pixels of a frame. frame_rate_hz: None if triggered from outside.
+    duration_s: from the first frame to the end of the last one or, without a rate, to the start of the last block.
     """
 
     run_id: int
@@ -188,8 +188,8 @@ class RecordingInfo:
 
     verdict: the one in the run's manifest. segments, compressed: number of all segments and of the compressed ones.
     bytes: size of all segments on the disk. maps: number of whole maps. config: name of the config, devices: names by
-    slot, versions: of the software, all at the time of recording. Without a manifest, what only it says is None or
-    empty. problems: one line each, as far as a look at a few blocks shows.
+    slot, versions: of the software, all at the time of recording. Without a manifest, verdict and config are None,
+    devices and versions empty. problems: one line each, as far as a look at a few blocks shows.
     """
 
     folder: Path
@@ -210,7 +210,7 @@ class RecordingInfo:
 def info(run: PathLike) -> RecordingInfo:
     """Describe a recording from its index, its manifest and a few of its blocks (`rig info`).
 
-    Raises UsageError if there is none, DamagedRecordingError if no block can be read.
+    Raises UsageError if there is no recording, DamagedRecordingError if no block can be read.
     """
     folder = Path(run)
     recording = open_recording(folder)
@@ -237,7 +237,7 @@ def info(run: PathLike) -> RecordingInfo:
 
 
 def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool:
-    """Whether a map's last frame and its closing marker are left after a repair; in a part, also its first frame."""
+    """Whether a repair left a map's last frame and closing marker (of a part, its first too); True without a repair."""
     if "repaired" not in manifest:
         return True
     begin = span.first_frame if "cut" in manifest else span.end_frame - 1
@@ -270,7 +270,7 @@ def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap
 
 
 def fitted_ratio(ratio: float, sweeps: Sequence[dict[str, Any]]) -> float:
-    """Ratio of the scanner's clock to nominal after these sweeps of a manifest. ratio: the one before the first."""
+    """Ratio of the scanner's clock to nominal after these sweeps of a manifest. ratio: before the first of them."""
     for i, sweep in enumerate(sweeps):
         if i and sweep["first_frame"] < sweeps[i - 1]["end_frame"]:
             ratio = 1.0  # another start of the SPAD

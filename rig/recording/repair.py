@@ -1,6 +1,6 @@
-"""Makes a torn recording whole: only sound blocks are left, with an index and a manifest that agree with them.
+"""Makes a damaged or unfinished recording whole: sound blocks, with an index and a manifest that agree with them.
 
-No frame is changed and no byte of a segment thrown away. Bytes that are not part of a sound block go to
+No frame is changed, and no byte but zeros is thrown away. Bytes that are not part of a sound block go to
 `frames-000000.torn`, at the place they had in the segment, a damaged compressed segment to `frames-000000.torn.zst` and
 a damaged manifest to `manifest.damaged.json`. What a later repair keeps gets a number: `frames-000000-1.torn`, ...
 """
@@ -40,7 +40,7 @@ class Repair:
 
 
 def repair(run: PathLike) -> Repair:
-    """Make a torn recording whole as far as possible. No frame of it is changed or thrown away (`rig repair`).
+    """Make a damaged or unfinished recording whole (`rig repair`). No frame is changed or thrown away.
 
     Raises UsageError if there is no recording or its run still goes on, RecordingError if it cannot be written.
     """
@@ -72,7 +72,7 @@ def repair(run: PathLike) -> Repair:
 
 
 def _put_in_order(found: Examination, done: list[str]) -> bool:
-    """Rename segments so that their numbers rise with the frames in them; return whether that was necessary."""
+    """Rename segments so that their order is that of the frames in them; return whether that was necessary."""
     paths = {segment.number: segment.path for segment in found.segments}
     numbers = list(dict.fromkeys(found.entries["segment"].tolist()))  # entries are in the order of their frames
     if numbers == sorted(numbers):
@@ -92,9 +92,8 @@ def _numbered(segment: Path, number: int) -> Path:
 
 
 def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """Move all but sound blocks to the torn file, leaving zeros, and end the segment after the last sound block.
-
-    A segment without a sound block is removed."""
+    """Move everything but sound blocks (ranges `blocks`) from a plain segment to its torn file, leaving zeros, and end
+    the segment after the last sound block. Without a sound block it is removed."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
@@ -119,7 +118,7 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
 
 
 def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None:
-    """If a compressed segment holds more than sound blocks, write these plain and keep the old file as torn."""
+    """Unless a compressed segment holds only sound blocks, write these to a plain one and keep the old file as torn."""
     end = round_up_to_page(blocks[-1][1]) if blocks else 0
     if blocks and segment.size == end and not any(_is_damaged(segment, a, b) for a, b in _between(blocks, end)):
         return
@@ -137,14 +136,14 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
 
 
 def _free(path: Path) -> Path:
-    """The path; with a number in its name if the file exists, so that what an earlier repair kept stays as it is."""
+    """The path, with a number in its name if the file exists: what an earlier repair kept stays as it is."""
     stem, _, rest = path.name.partition(".")
     numbered = (path.with_name(f"{stem}-{number}.{rest}") for number in count(1))
     return next(one for one in chain([path], numbered) if not one.exists())
 
 
 def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:
-    """Whether anything but zeros lies in a range, or it cannot be read."""
+    """Whether a range holds anything but zeros or cannot be read."""
     try:
         return _used(segment, begin, stop) > begin
     except CorruptBlock:
@@ -161,13 +160,13 @@ def _between(blocks: list[Range], size: int) -> Iterator[Range]:
 
 
 def _used(segment: SegmentReader, begin: int, stop: int) -> int:
-    """End of the last byte in a range that is not zero; `begin` if all are zero."""
+    """Offset after the last byte from `begin` to before `stop` that is not zero; `begin` if all are zero."""
     data = segment.at(begin, stop - begin)
     return stop - int((data[::-1] != 0).argmax()) if data.any() else begin
 
 
 def _copy(segment: SegmentReader, pieces: list[Range], file: BinaryIO) -> None:
-    """Copy pieces of a segment to the same places of another file, which is on the disk when this returns."""
+    """Copy pieces of a segment to the same places of another file, and sync it."""
     for begin, stop in pieces:
         file.seek(begin)
         file.write(segment.at(begin, stop - begin).data)
@@ -215,7 +214,7 @@ def _write_manifest(folder: Path, found: Examination, done: list[str]) -> None:
 
 
 def _recording(found: Examination) -> dict[str, Any]:
-    """The part of `Recording.content` that a repair changes. Starts that the manifest lacks are derived from blocks."""
+    """The part of `Recording.content` that a repair changes. A missing list of starts is made from the blocks."""
     segments = [np.frombuffer(b"".join(block.entry for block in run), INDEX_RECORD)["segment"] for run in found.runs]
     with_blocks = set(found.entries["segment"].tolist())
     content: dict[str, Any] = {
@@ -225,7 +224,7 @@ def _recording(found: Examination) -> dict[str, Any]:
         "bytes": found.bytes,
     }
     starts = ((found.manifest or {}).get("recording") or {}).get("starts")
-    if starts is None:  # whole sweeps, and the first segment
+    if starts is None:  # count whole sweeps
         starts = [{"sweeps": max(0, run[-1].last_sweep - max(1, run[0].header.sweep))} for run in found.runs]
     if len(starts) == len(found.runs):
         content["starts"] = [{**start, "segment": int(of.min())} for start, of in zip(starts, segments, strict=True)]

@@ -1,7 +1,8 @@
-"""Prepares a recording to be played like a scan: its plan and its starts. Other devices are recorded, emulated or real.
+"""Prepares a recording to be played like a scan: its plan, and its starts of the SPAD (frames without a pause).
 
-Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start of
-the SPAD is played as one start. So a map is made from exactly the same frames in the same order, at any speed.
+Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start is
+played as one start. So a map is made from exactly the same frames in the same order, at any speed. Scanner, laser and
+sync source are played too, unless emulated or real ones take part.
 """
 
 import itertools
@@ -47,11 +48,11 @@ from rig.run_folder.manifest import (
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
 SILENCE_S = 5.0
-"""Seconds without frames, in the time of the recording, after which the SPAD counts as failed, as in a live scan."""
+"""Seconds of recorded time without frames after which the SPAD counts as failed, as in a live scan."""
 ENDLESS = 1_000_000_000
 """Number of maps that stands for a loop without end."""
 RECORDED = ("scanner", "laser", "sync")
-"""Slots of the devices, besides the SPAD, that a recording can stand for."""
+"""Slots of the devices that a recording can replace, besides the SPAD."""
 
 
 def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = None) -> RigConfig:
@@ -101,10 +102,11 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan with which the frames were taken, adapted to the present calibration, and the timing of the configured
-    SPAD.
+    """The plan with which the frames were taken, adapted to the calibration `model`, and the timing of the SPAD, which
+    is configured here.
 
-    Raises UsageError as `read_plan` does, and DamagedRecordingError if the frames differ in size from the plan's.
+    Raises UsageError as `read_plan` does and for a calibration that does not fit the plan, DamagedRecordingError if the
+    frames differ in size from the plan's, and DeviceError as `SpadArray.configure` does.
     """
     from rig.plan.calibration_reach import recalibrated, whole_rows
 
@@ -126,17 +128,17 @@ def replay_plan(
 
 
 def _begun_with(run: Path) -> str | None:
-    """File of the state that a recording's estimator began with; None if it learned everything anew."""
+    """File of the learned state with which the recording's estimator began; None if there is none."""
     return str((run / LEARNED_FILE).absolute()) if (run / LEARNED_FILE).exists() else None
 
 
 class ReplayFacts:
     """Facts about a recording for its replay, as `rig.scan.scan.LiveFacts` has them for a live scan.
 
-    maps: number of maps to take; None for all. starts: those of the SPAD, one after the other. learned: in a part that
-    was cut out, the states with which its maps were estimated; empty if the estimator is to learn again. Raises
-    UsageError if there are too few maps and no loop, DamagedRecordingError if a start of the SPAD is missing or a kept
-    state is unreadable.
+    maps: number of maps to take, None for all (ENDLESS in a loop). starts: those of the SPAD, one after the other.
+    learned: in a part cut from a recording, the state of the estimator for each of its maps; empty if the estimator is
+    to learn again. Raises UsageError if there is no whole map, or fewer than `maps` and no loop;
+    DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
     """
 
     command = "replay"
@@ -168,12 +170,12 @@ class ReplayFacts:
 
     @property
     def report(self) -> PaceReport:
-        """The report on how well the clock was kept."""
+        """How late blocks came by the clock of the replay."""
         return self._spad.pace.report
 
     @property
     def silence_s(self) -> float:
-        """Longest time without frames that is allowed: longer at a slow clock, and practically unlimited in steps."""
+        """Longest time without frames that is allowed: longer at a slow clock, and 1e6 s if frames wait for steps."""
         pace = self._spad.pace
         return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
@@ -197,7 +199,7 @@ class ReplayFacts:
         return truth
 
     def lost_outside(self, sweeps: Sequence[SweepAccount]) -> list[Gap]:
-        """Frames (first, last) lost outside all these sweeps; empty if the number of maps was given. Logs how many."""
+        """(first, last) of frames lost outside all these sweeps, also logged; empty if the number of maps was given."""
         if not self._all:
             return []
         spans = _by_start(sweeps, [start.number for start in self._played])
@@ -217,7 +219,7 @@ class RecordedStart:
     """One start of the SPAD in a recording.
 
     begin: the sweep with which its whole maps begin. first_map: number of the first of these maps in the recording.
-    sweeps: number of these maps. gone: frames at the start's ends that the manifest mentions but no block contains.
+    sweeps: how many whole maps. gone: frames at the start's ends that the manifest mentions but no block contains.
     """
 
     number: int
@@ -228,9 +230,10 @@ class RecordedStart:
 
 
 def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str, Any]) -> list[RecordedStart]:
-    """The whole sweeps of each start of the SPAD that the run took and whose frames are left.
+    """For each start of the SPAD, the whole sweeps that the run took and whose frames are left.
 
-    Raises DamagedRecordingError if a start is missing but a later one is there, since their maps would be confused.
+    Raises DamagedRecordingError if a start is missing but a later one is there, since their maps would be confused, or
+    if a start of a cut part has no sound block.
     """
     begins = _part_starts(recording, manifest.get("cut"))
     starts = (manifest.get("recording") or {}).get("starts")
@@ -258,7 +261,7 @@ def recorded_sweeps(recording: RunRecording, plan: ScanPlan, manifest: dict[str,
 def _what_is_left(
     start: RecordedStart, recording: RunRecording, run: RecordedRun, plan: ScanPlan, manifest: dict[str, Any]
 ) -> RecordedStart:
-    """The part of a start whose frames are left. start: as the run took it."""
+    """The whole maps of a start whose frames are left. start: as the run took it."""
     first, end = _readable_range(recording, run)
     begin, first_map, maps = start.begin, start.first_map, start.sweeps
     noted = manifest.get("sweeps")
@@ -284,7 +287,7 @@ def _what_is_left(
 
 
 def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[int, list[Gap]]:
-    """(first frame, end frame) of each sweep, by the number of its start; frame numbers begin anew with each start."""
+    """(first frame, last + 1) of each sweep, by the number of its start. Frame numbers begin anew with each start."""
     spans: dict[int, list[Gap]] = {}
     at, end = 0, 0
     for sweep in sweeps:
@@ -296,8 +299,8 @@ def _by_start(sweeps: Sequence[SweepAccount], numbers: Sequence[int]) -> dict[in
 
 
 def _whole_sweeps(recording: RunRecording, run: RecordedRun, plan: ScanPlan) -> int:
-    """Number of sweeps complete at the end of a start, by its markers or, with a blanking pattern, by its frames;
-    never more than it has frames, whatever headers say."""
+    """Number of sweeps that are complete at the end of a start: by its markers or, with a blanking pattern in their
+    place, by its frames. Never more than it has frames, whatever headers say."""
     if plan.blanking is not None:
         frames = float(plan.frames_per_sweep)
         return min(run.frames, max(0, int((_readable_range(recording, run)[1] - plan.frames_for(0)) / frames)))
@@ -312,7 +315,7 @@ def _end_block(recording: RunRecording, run: RecordedRun, *, last: bool) -> Fram
 
 
 def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int]:
-    """First frame of a start in sound blocks, and the one after the last; (first, first) if no block is sound."""
+    """First frame of a start's sound blocks, and last + 1; twice `run.first_frame` if none is sound."""
     first, last = (_end_block(recording, run, last=end) for end in (False, True))
     if first is None or last is None:
         return run.first_frame, run.first_frame
@@ -320,7 +323,7 @@ def _readable_range(recording: RunRecording, run: RecordedRun) -> tuple[int, int
 
 
 def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]:
-    """Gaps that a repair found, and the frames of damaged blocks at the ends of starts."""
+    """Gaps that a repair noted, and those of damaged blocks at the ends of starts, in order."""
     gaps = list(dict.fromkeys(known_missing(manifest) or ()))
     for run in recording.runs:
         first, end = _readable_range(recording, run)
@@ -330,7 +333,7 @@ def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]
 
 
 def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[FirstSweep]:
-    """The sweep with which the maps of each start begin: the first one, except in a part that was cut."""
+    """The sweep with which the maps of each start begin: number 0, except in a cut part (`cut` of its manifest)."""
     if cut is None:
         return [FirstSweep() for _ in recording.runs]
     ratios = cut.get("clock_ratios") or []
@@ -350,9 +353,8 @@ def _part_starts(recording: RunRecording, cut: dict[str, Any] | None) -> list[Fi
 def _part_learned(
     folder: Path, manifest: dict[str, Any], estimate: EstimateConfig, model: RigModel | None
 ) -> list[RowModel]:
-    """States that the maps of a part were estimated with, if estimator and calibration are the same; otherwise empty.
-
-    Empty for a whole recording too: it learns the same again from its first map on.
+    """The state of the estimator for each map of a cut part, if all are kept and estimator, its prior and calibration
+    are as they were; otherwise empty. Empty for a whole recording too: its replay learns the same states again.
     """
     before = (manifest.get("config") or {}).get("estimate") or {}
     same = before.get("estimator") == estimate.estimator and estimate.estimator in LEARNING
@@ -364,14 +366,14 @@ def _part_learned(
     states = []
     for i in range(manifest["cut"]["maps"][1] - manifest["cut"]["maps"][0]):
         state = _kept(folder / "learned" / f"{i:06d}.npz", RowModel.from_arrays)
-        if state is None:  # the whole kept those of some maps only
+        if state is None:  # the whole recording kept those of some maps only
             return []
         states.append(state)
     return states
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """Make something of a file's arrays; None if there is no file. Raises DamagedRecordingError if it is unreadable."""
+    """What `make` makes of a file's arrays; None without the file. Raises DamagedRecordingError if it is unreadable."""
     if not file.exists():
         return None
     try:
@@ -381,7 +383,7 @@ def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
 
 
 def _scan_of(plan: ScanPlan) -> dict[str, Any]:
-    """The scan section of the config that a plan came from, as far as a replay needs it."""
+    """The section `scan` of a config that suits a plan, as far as a replay needs it."""
     return {
         "columns": plan.columns,
         "exposures": plan.exposures,

@@ -2,7 +2,7 @@
 
 Blocks are written several at a time, past the page cache if the system allows it (O_DIRECT), without copying pixels if
 they are aligned. This takes 0.3 s of CPU per GB, nearly all of it for the checksum, compared with 2 s through the page
-cache, and little is left for a sync. `Space` is the most room that a recorded run will take.
+cache, and a sync has little left to do. `Space` is the most room that a recorded run will take.
 """
 
 import errno
@@ -37,7 +37,7 @@ class Staging(threading.local):
         self._memory = mmap.mmap(-1, PAGE_BYTES)
 
     def take(self, size: int) -> memoryview:
-        """Memory of `size` bytes, with old content."""
+        """Memory of `size` bytes of the calling thread, valid until its next call. It still has old content."""
         if len(self._memory) < size:
             self._memory = mmap.mmap(-1, paged(size))
         return memoryview(self._memory)[:size]
@@ -53,7 +53,7 @@ class OpenSegment:
         self.placed = 0
         """Offset of the next block, bytes."""
         self.end = 0
-        """Offset in bytes of the first block that is not written yet: all blocks before it are."""
+        """Offset in bytes up to which all blocks are written."""
         self.synced = 0
         """Value of `end` at the beginning of the last sync."""
         self._lock = threading.Lock()
@@ -83,14 +83,14 @@ class OpenSegment:
                 pieces[0] = pieces[0][written:]
 
     def sync(self) -> None:
-        """Make sure that written data survives a loss of power. Raises OSError."""
+        """Make sure that the blocks before `end` survive a loss of power. Raises OSError."""
         if self.synced != self.end:
             end = self.end
             _sync_data(self._fd)
             self.synced = end
 
     def close(self) -> None:
-        """End the file after its last whole block; without any block it is removed. Raises OSError."""
+        """End the file after its last whole block, or remove it if it has none; nothing if closed. Raises OSError."""
         if self._fd < 0:
             return
         fd, self._fd = self._fd, -1
@@ -116,12 +116,12 @@ class OpenSegment:
 
 
 def paged(size: int) -> int:
-    """Size in bytes of the whole pages that `size` bytes take."""
+    """`size` bytes, rounded up to whole pages."""
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 
 def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
-    """A block's bytes with its padding: whole pages of pixels in place if aligned, the rest copied to `staging`."""
+    """A block's bytes with its padding. Whole pages of pixels stay in place if aligned; the rest is in `staging`."""
     *front, bits, tail = block_parts(block)
     front_bytes = sum(len(part) for part in front)
     before = min(paged(front_bytes) - front_bytes, len(bits))
@@ -187,7 +187,7 @@ class Space:
         return cls(folder, recording_bytes, map_bytes, shutil.disk_usage(there).free)
 
     def require(self) -> None:
-        """Raise UsageError if the disk has not enough room."""
+        """Raise UsageError if the disk has too little room."""
         if self.recording_bytes + self.map_bytes > self.free_bytes:
             raise UsageError(
                 f"the recording will take at most {_gb(self.recording_bytes)} and the maps {_gb(self.map_bytes)}, the "

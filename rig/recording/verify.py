@@ -36,9 +36,9 @@ class Integrity(StrEnum):
 
     INTACT = "intact"
     GAPS = "gaps"
-    """Whole, but the device reports lost frames, or a repair found frames missing and noted that."""
+    """Undamaged, but the device lost frames, or a repair noted frames as missing."""
     UNFINISHED = "unfinished"
-    """The run is not over, or was killed, or went on without the recording; nothing else is wrong."""
+    """Undamaged, but the run is not over, was killed, or went on after the recording had ended. Gaps are possible."""
     DAMAGED = "damaged"
 
 
@@ -46,10 +46,10 @@ class Integrity(StrEnum):
 class Verification:
     """Verdict on a recording, with its evidence.
 
-    runs: number of starts of the SPAD. blocks, frames: number of sound ones. bytes: what sound blocks take in the
-    segments. lost: frames that the device lost or a repair found missing. gaps: their ranges, (number of the start,
-    first, last). problems: one line each. run: verdict of the run that was recorded, None if unknown. ended: why the
-    recording ended before the run; None if it did not.
+    runs: number of starts of the SPAD. blocks, frames, bytes: number of sound blocks, of frames and bytes in them (with
+    padding). lost: number of frames that the device lost or a repair noted as missing. gaps: their ranges, (number of
+    the start, first, last). problems: one line each. run: verdict of the run that was recorded, None if unknown.
+    ended: why the recording ended before the run; None if it did not.
     """
 
     verdict: Integrity
@@ -74,7 +74,7 @@ class Verification:
 class Examination:
     """Everything found out about a recording.
 
-    runs: the undamaged blocks of each start of the SPAD, in the order of their frames.
+    runs: the sound blocks of each start of the SPAD, in order. joined: the gaps. manifest: None if missing or damaged.
     """
 
     segments: list[SegmentReader]
@@ -85,7 +85,7 @@ class Examination:
 
     @property
     def bytes(self) -> int:
-        """Bytes that the sound blocks take in their segments."""
+        """Bytes that the sound blocks take in their segments, with padding."""
         return int(round_up_to_page(self.entries["length"]).sum())
 
     @property
@@ -156,7 +156,7 @@ def examine(folder: Path) -> Examination:
 
 
 def _runs(contents: Contents, sound: Sequence[SoundBlock], problems: list[str]) -> list[list[SoundBlock]]:
-    """The sound blocks of each start, in order; adds a line to `problems` for each block that is left out or gone."""
+    """The sound blocks of each start, in order. Adds lines on the blocks that are left out or gone to `problems`."""
     headers: dict[int, list[BlockHeader]] = {}
     for block in sound:
         headers.setdefault(block.header.run_id, []).append(block.header)
@@ -202,7 +202,7 @@ def _left_out(block: SoundBlock, why: str) -> str:
 def _against_manifest(
     manifest: dict[str, Any], segments: Sequence[SegmentReader], runs: Sequence[Run], joined: Continuity
 ) -> list[str]:
-    """A line for each number of blocks, segments, frames or lost frames that a finished run's manifest has wrong."""
+    """Lines on blocks, segments and frames that are not as many as a finished run's manifest or the device says."""
     recording = manifest.get("recording") or {}
     frames = sum(block.n_frames for run in runs for block in run)
     there = {

@@ -1,12 +1,12 @@
-"""Writes a recording: segments of SPB1 blocks and their index, complete to the last block however the program ends.
+"""Writes a recording: segments (files of SPB1 blocks) and their index, usable however the program ends.
 
 A block counts once the system has all its bytes and those of every block before it; then its index record is written.
-So a killed program loses no block that counted. A loss of power loses at most blocks younger than `SYNC_INTERVAL_S`,
-since a thread syncs the files to the disk, blocks before index.
+So a killed program loses no block that counted. Unless syncs are slow, a loss of power loses at most blocks younger
+than `SYNC_INTERVAL_S`, since a thread syncs the files to the disk, blocks before index.
 
 `Recording` does this. `Recorder` is the pipeline's thread that passes the blocks of one start of the SPAD to the
-recording. The recording's threads write several blocks at a time, straight from their slots in the ring. The recorder
-is a required reader of the ring: if the disk is slower than the stream, the ring fills and the overload policy decides.
+recording. The recording's threads write several blocks at a time, straight from the slots of the ring (`drivers.ring`).
+The recorder is a required reader: if the disk is slower than the stream, the ring fills and its `on_full` decides.
 """
 
 import errno
@@ -36,7 +36,7 @@ SYNC_INTERVAL_S: Final = 0.2
 _SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
 """Seconds from the end of one sync to the next: a block may have to wait for the sync under way and for the next."""
 WRITERS: Final = 4
-"""Blocks written at a time: one thread computes checksums at some 4 GB/s, and disks are faster with a queue."""
+"""Number of blocks written at a time: a thread computes checksums at some 4 GB/s, and disks are faster with a queue."""
 RESERVE_FILE: Final = ".recording.reserve"
 RESERVE_BYTES: Final = 1 << 20
 """Bytes reserved beside the recording, so that manifest and summary have room if the recording fills the disk."""
@@ -44,7 +44,7 @@ RESERVE_BYTES: Final = 1 << 20
 
 @dataclass(slots=True, eq=False)
 class _Placed:
-    """A block that is being written. end: offset of the block's end in its segment."""
+    """A block that is not indexed yet. end: offset of its end in its segment. done: whether it is written."""
 
     segment: OpenSegment
     end: int
@@ -56,8 +56,8 @@ class Recording:
     """A recording that grows block by block in a folder; whatever fails, it ends after a whole block.
 
     Only one thread may submit and append. expected_bytes: room to set aside in all; None: `segment_bytes` per segment.
-    on_begin: called by `begin`. on_sync: called with every sync, on its thread, and when the recording is closed.
-    Raises RecordingError if the folder cannot be written.
+    on_begin: called by `begin`. on_sync: called after every sync, on the thread that syncs, and by `close`.
+    Raises RecordingError if the folder cannot be written or has an index already.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class Recording:
     ) -> None:
         self.folder = folder
         self.blocks = 0
-        """Blocks that count."""
+        """Number of blocks that count."""
         self.bytes = 0
         """Bytes that these blocks take in the segments, with padding."""
         self.busy_s = 0.0
-        """Time of all writers together, for checksums and writing."""
+        """Time for checksums and writing, summed over the writers."""
         self.files: list[str] = []
         self.starts: list[dict[str, int]] = []
         """For each start of the SPAD, the planned number of `sweeps` and the number of its first `segment`."""
@@ -122,9 +122,9 @@ class Recording:
         self.submit(block).result()
 
     def submit(self, block: FrameBlock) -> "Future[None]":
-        """Begin to write a block after the others. The block's memory must not change until the result is available.
+        """Begin to write a block after the others. The block's memory must not change until the future is done.
 
-        The result, or this call, raises RecordingError if a block could not be written; from that block on none counts.
+        The future, or this call, raises RecordingError if a block could not be written; from that block on none counts.
         """
         header = block.header
         size = paged(BlockLayout(block.n_frames, header.width, header.height).block_bytes)
@@ -214,7 +214,7 @@ class Recording:
                 self.busy_s += time.perf_counter() - begun
 
     def _count(self, placed: _Placed) -> None:
-        """Note that a block is written, and index all blocks before the first one that is not written (or failed)."""
+        """Note that a block is written, and index all written blocks before the first one that is not written yet."""
         with self._lock:
             placed.done = True
             while self._order and self._order[0].done:
@@ -228,7 +228,7 @@ class Recording:
                 self.blocks += 1
 
     def _sync_on(self) -> None:
-        """Sync now and then until the recording is closed; runs as a thread."""
+        """Sync at intervals until the recording is closed or a sync fails; runs as a thread."""
         while not self._closed.wait(_SYNC_EVERY_S):
             try:
                 self._sync()
@@ -272,9 +272,9 @@ def _reason(error: BaseException) -> str:
 
 
 class Recorder:
-    """Thread that records the blocks of one start of the SPAD, up to the last one; it ends once everything is written.
+    """Records the blocks of one start of the SPAD. `thread` ends once the last one is written.
 
-    reader: holds as many blocks as may be written at a time. on_failure: called on this thread when `error` is set.
+    reader: holds as many blocks as may be written at a time. on_failure: called on `thread` when `error` is set.
     """
 
     def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
@@ -301,7 +301,7 @@ class Recorder:
                 self._on_failure()
 
     def _next(self) -> FrameBlock | None:
-        """The next block; None if none will come. An error of the source is reported by the counting thread."""
+        """The next block; None after the last one, or after an error of the source (the counting thread reports it)."""
         try:
             return self._reader.next()
         except Exception:

@@ -1,6 +1,6 @@
 """Draws charts as SVG text: curves over linear or logarithmic axes, side by side, with one legend, on a white ground.
 
-Pictures in the repository are SVG (docs/decisions/0008); a handful of curves needs no library.
+Pictures in the repository are SVG (docs/decisions/0008-pictures-are-svg.md); a handful of curves needs no library.
 """
 
 import math
@@ -26,7 +26,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A curve or points. Points that are not finite, or that a logarithmic axis cannot show, are left out.
+    """A curve, or single points. Those that are not finite or that a logarithmic axis cannot show are left out.
 
     intervals: (low, high) in y of each point. names: small text beside each point.
     """
@@ -53,7 +53,7 @@ class Axis:
 
     @classmethod
     def over(cls, values: Sequence[float], log: bool, start_px: float, end_px: float) -> "Axis":
-        """Make an axis that shows all values, with some margin. A logarithmic one shows those above zero."""
+        """Make an axis that shows all finite values, with some margin. A logarithmic one shows those above zero."""
         shown = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
         low, high = min(shown), max(shown)
         if log:
@@ -81,7 +81,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Curves over one pair of axes. front: points of a broad band behind the curves, by rising x."""
+    """Curves over one pair of axes. front: points, by rising x, of a broad band that is drawn behind the curves."""
 
     title: str
     x_label: str
@@ -92,7 +92,7 @@ class Panel:
     front: Sequence[Point] = ()
 
     def axes(self) -> tuple[Axis, Axis]:
-        """The axes of x and y, which show all points of the curves and, above 0, their intervals."""
+        """The axes of x and y, which show all points of the curves, and their intervals as far as they are above 0."""
         points = [point for series in self.series for point in series.points]
         ends = [(math.nan, y) for series in self.series for interval in series.intervals for y in interval if y > 0]
         width, height = PANEL_PX
@@ -100,7 +100,7 @@ class Panel:
         return x, Axis.over([point[1] for point in points + ends], self.y_log, height - _BOTTOM, _TOP)
 
     def svg(self) -> str:
-        """Axes, band and curves as SVG elements, with the origin at (0, 0)."""
+        """Axes, band and curves as SVG elements; the panel's upper left corner is at (0, 0)."""
         x, y = self.axes()
         parts = [_axes(x, y, self)]
         if self.front:

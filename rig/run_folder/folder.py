@@ -6,8 +6,8 @@
 
 A new folder is complete when it appears: everything is written to a hidden folder beside it, which is renamed at the
 end. If the folder exists and is empty, it is filled at the end, file by file, summary.json last. The folder of a
-recording is there from the start and grows in place. Data written with `replace_file` and
-`sync_folder` survives a loss of power.
+recording is there from the start and grows in place. Data written with `replace_file`, then `sync_folder`, survives a
+loss of power.
 """
 
 import io
@@ -77,7 +77,7 @@ class RunFolder:
     def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
         """Write all files of one map. rays: (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
 
-        If one cannot be written (disk full), the map's other files are removed too, and UsageError says why.
+        If a file cannot be written (disk full), the map's other files are removed too, and UsageError says why.
         """
         name = f"{index:06d}"
         files = {
@@ -111,8 +111,8 @@ class RunFolder:
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write `name` (manifest.json, summary.json) as strict JSON, the manifest sealed. A reader sees either the old
-        file or the new one. Raises UsageError if it cannot be written."""
+        """Write `name` (manifest.json, summary.json) as strict JSON, the manifest with a checksum. A reader sees either
+        the old file or the new one. Raises UsageError if it cannot be written."""
         text = json_text(content)
         text = sealed_text(text) if name == MANIFEST else text
         file = self.place(name)
@@ -128,14 +128,14 @@ class RunFolder:
         self._write({name: text.encode()})
 
     def keep(self) -> None:
-        """Keep everything as it is, so that a recording is kept even if the run does not come to its end."""
+        """Keep everything as it is, even if the run does not come to its end. Only for a folder that grows in place."""
         assert self._in_place, "a run folder that is no recording appears whole or not at all"
         self._scratch = None
         self._made_parents.clear()
 
     def publish(self) -> Path:
-        """Make the folder appear and return its path: its name, or NAME-2 and so on if the name has been taken
-        meanwhile. Raises UsageError if it cannot.
+        """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if that has been
+        taken meanwhile. Raises UsageError if that fails.
         """
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
@@ -164,10 +164,10 @@ class RunFolder:
         return next(path for path in beside if _renamed(scratch, path))
 
     def discard(self) -> None:
-        """Remove everything that was not published, and the folders made for it."""
+        """Remove everything that was not published or kept, and the folders made for it."""
         if self._scratch is not None:
             if self._in_place:
-                mine = not is_held(self._scratch / INDEX_FILE)  # else another run took the folder while it was empty
+                mine = not is_held(self._scratch / INDEX_FILE)  # if it is held, another run took the folder while empty
                 for child in self._scratch.iterdir() if mine else ():
                     shutil.rmtree(child, ignore_errors=True) if child.is_dir() else child.unlink(missing_ok=True)
             else:
@@ -213,14 +213,13 @@ class RunFolder:
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Content as strict JSON. NaN and infinity become null, arrays become lists, fractions numbers, and paths text."""
+    """Content as strict JSON. NaN and infinity become null, arrays lists, fractions numbers, and all else text."""
     return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """The choice of maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None for only
-    the last."""
+    """Which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
 
     step: int | None = 1
 
@@ -237,7 +236,7 @@ class SavePolicy:
         return min(maps, 1) if self.step is None else -(-maps // self.step)
 
     def keeps(self, index: int) -> bool:
-        """Whether map `index` is written as soon as it is ready."""
+        """Whether map `index` is written as soon as it is ready. False for all if only the last one is written."""
         return self.step is not None and index % self.step == 0
 
 
@@ -277,12 +276,12 @@ def _unwritable(path: Path, error: OSError) -> UsageError:
 
 
 def write_learned(file: Path, state: Learned) -> None:
-    """Write a learned state in one step, without the labels of its last map, for `read_learned`. Raises OSError."""
+    """Write a learned state, without the labels of its last map, as `replace_file` does. Raises OSError."""
     replace_file(file, _npz_bytes({name: value for name, value in state.arrays().items() if name != "before"}))
 
 
 def read_learned(file: Path) -> RowModel:
-    """The state in a file. Raises UsageError if there is none, or the file is not readable."""
+    """The learned state in a file. Raises UsageError if the file is missing or holds none."""
     try:
         return RowModel.from_arrays(load_arrays(file))
     except (OSError, ValueError, KeyError) as error:
@@ -300,18 +299,18 @@ def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 try:
     import fcntl
-except ImportError:  # Windows lets nobody else change a file that is open
+except ImportError:  # on Windows nobody else can change a file that is open
     fcntl = None  # type: ignore[assignment]
 
 
 def hold(fd: int) -> None:
-    """Lock an open file for as long as it is open. Raises OSError if another process holds the lock."""
+    """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock."""
     if fcntl is not None:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(file: Path) -> bool:
-    """Whether a process has locked a file; False if there is no such file, and on Windows."""
+    """Whether a file is locked (`hold`). False if there is no such file, and on Windows."""
     if fcntl is None or not file.exists():
         return False
     with file.open("rb") as stream:

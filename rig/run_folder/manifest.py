@@ -1,7 +1,7 @@
 """The manifest of a run, `manifest.json`. It is sealed with a checksum, since depth depends on its content.
 
-The key `crc32` has the CRC-32 (zlib) of all other content, written as JSON without spaces and with sorted keys. So a
-digit that changed on the disk is detected, but different line breaks are accepted.
+The key `crc32` (the seal) has the CRC-32 (zlib) of all other content, as JSON without spaces and with sorted keys. So
+a digit that changed on the disk is detected, but different line breaks are accepted.
 """
 
 import json
@@ -133,12 +133,12 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def is_cut_short(manifest: Mapping[str, Any]) -> bool:
-    """Whether frames after the first maps may be missing, because the disk was full or the recording was repaired."""
+    """Whether frames after the first maps may be missing: the recording ended before the run, or was repaired."""
     return "repaired" in manifest or ended_early(manifest) is not None
 
 
 def ended_early(manifest: Mapping[str, Any]) -> str | None:
-    """Reason why a recording ended before its run, such as a full disk; None if it did not or was repaired since."""
+    """Reason why a recording ended before its run, such as a full disk; None if it did not, and after a repair."""
     if "repaired" in manifest:
         return None
     failed = (manifest.get("recording") or {}).get("failed")
@@ -146,14 +146,13 @@ def ended_early(manifest: Mapping[str, Any]) -> str | None:
 
 
 def ended_before_last_map(manifest: Mapping[str, Any]) -> bool:
-    """Whether a run ended before it had made maps of all sweeps. There may be whole sweeps after those of the
-    manifest."""
+    """Whether a run ended before it had made maps of all sweeps, so that whole sweeps may follow those listed."""
     starts = (manifest.get("recording") or {}).get("starts") or []
     return len(manifest.get("sweeps") or []) < sum(int(start["sweeps"]) for start in starts)
 
 
 def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
-    """Frames that a repair found missing; None without a repair or without a manifest."""
+    """Frames that a repair noted as missing; None without a repair or without a manifest."""
     if manifest is None or "repaired" not in manifest:
         return None
     return [(int(run), int(first), int(last)) for run, first, last in manifest.get("missing") or []]

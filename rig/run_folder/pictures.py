@@ -29,8 +29,8 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 def depth_picture(
     depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
 ) -> NDArray[np.uint8]:
-    """Depth in colours, near red to far blue, black where there is none, with a scale at the right; all black without
-    limits. uint8 BGR (rows, width + SCALE_PX, 3)."""
+    """Depth in colours, from red (near) to blue (far), black where there is none, with a scale at the right; all black
+    without limits. uint8 BGR (rows, width + SCALE_PX, 3)."""
     import cv2
 
     rows, width = depth_m.shape
@@ -39,7 +39,7 @@ def depth_picture(
         return picture
     low, high = limits
     known = np.isfinite(depth_m)
-    if known.any():  # none is if all frames were lost; then limits are those of a map before
+    if known.any():  # no pixel is if all frames were lost; then limits are those of an earlier map
         picture[:, :width][known] = _colours(depth_m[known], limits)
     top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
     bar = np.linspace(low, high, bottom - top)
@@ -54,9 +54,9 @@ def depth_picture(
 
 
 def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Summed counts as grey, square-root scaled (shot noise then looks alike in dark and bright); (rows, width)."""
+    """Summed counts as grey, uint8 (rows, width): square roots, so that shot noise looks alike in dark and bright."""
     level = _without_window_steps(intensity)
-    # Hot pixels and glints beyond the brightest 0.5 % must not darken the rest, nor haze everywhere wash it out.
+    # The brightest 0.5 % (hot pixels, glints) must not darken the rest, and haze over all pixels not wash it out.
     low, high = np.percentile(level, [1, 99.5])
     root = np.sqrt(np.clip(level - low, 0, None))
     top = max(float(np.sqrt(high - low)), 1.0)

@@ -27,12 +27,12 @@ class PipelineStats:
     """Figures of a pipeline during a run or at its end. Times are wall time in seconds; None means that there is no
     such stage.
 
-    source_fill_s: in the SPAD's `fill`, without source_wait_s, the time spent waiting for a free slot of the ring.
+    source_fill_s: in the SPAD's `fill`, without source_wait_s. source_wait_s: there, waiting for a free ring slot.
     ring_high_water: largest number of slots in use at one time, of ring_slots, which take ring_bytes together.
     dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
     counts to map, as `SharedTime` charges it. map_wait_s: waiting for room among the maps that the caller has not taken
     yet; map_queue is that room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and
-    writing. monitor_updates: views shown. monitor_skipped_blocks: blocks that the monitor did not show.
+    writing, summed over threads. monitor_updates: views shown. monitor_skipped_blocks: blocks that were not shown.
     """
 
     source_fill_s: float = 0.0
@@ -54,7 +54,7 @@ class PipelineStats:
     monitor_skipped_blocks: int | None = None
 
     def and_then(self, later: "PipelineStats") -> "PipelineStats":
-        """Combined figures of both, for runs that start the SPAD several times."""
+        """The figures of this start of the SPAD and a later one together."""
         joined: dict[str, Any] = {}
         for name in (each.name for each in fields(self)):
             values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
@@ -82,9 +82,9 @@ class RunVerdict(StrEnum):
 class RunFrames:
     """Frames between the first and the last scan marker, including dark and fly-back ones; expected = received + lost.
 
-    If a run ended before its last map these are all frames that came or were lost, while lit counts those of its whole
-    maps. crc_errors: blocks refused as damaged, out of order or of another size; None if the source does not say. lit:
-    frames counted for columns.
+    If a run ended before its last map, these are all frames that came or were lost; only `lit` is of its whole maps.
+    crc_errors: blocks refused as damaged, out of order or of another size; None if the source does not say. lit: frames
+    counted for columns.
     """
 
     expected: int = 0
@@ -96,11 +96,11 @@ class RunFrames:
 
 @dataclass(frozen=True, slots=True)
 class Synchronisation:
-    """The binding of a run's frames to columns: by what, and how well.
+    """The binding of a run's frames to columns: by what, and how well (see `rig.count.bind.SweepClock`).
 
-    residual_columns: largest residual of its sweeps in columns (`rig.count.bind.SweepClock`); None if a sweep could not
-    be checked. clock_error: the one farthest from 0. detection_probability: smallest chance of all sweeps that a
-    pattern as bright as the sweep's is found; None if markers bound the frames.
+    residual_columns: largest residual of all sweeps, in columns; None if a sweep could not be checked. clock_error: the
+    one farthest from 0 of all sweeps. detection_probability: smallest of all sweeps' chances that a pattern as bright
+    as the sweep's is found; None if markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -122,7 +122,7 @@ Errors = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class TruthErrors:
-    """Errors against a known truth, averaged over maps (of medians, the median over maps)."""
+    """Errors against a known truth: means over the maps, but for medians the median over the maps."""
 
     stripe_error_px: Errors
     depth_error_m: Errors
@@ -130,12 +130,12 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A run in figures. Times are in seconds of sensor and computer, fractions are of camera pixels; None means no
-    value.
+    """A run in figures. Times are in seconds, of the sensor or the computer. None means no value.
 
-    fog: of the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration:
-    reasons against the calibration that the user accepted. estimator_why: reason for the estimator if the run chose it.
-    learned: whether the first map was estimated with the state of an earlier run, and why if not; if a file was named.
+    valid_fraction: share of camera pixels with depth, mean of the maps. fog: of the last map. verdict_reasons: reasons
+    against maps, found in the maps themselves. accepted_calibration: reasons against the calibration that the user
+    accepted. estimator_why: why the run chose this estimator; empty if it was named. learned: if a file for learned
+    states was named, whether the first map was estimated with the state in it, and why if not; else empty.
     """
 
     maps: int
@@ -161,7 +161,7 @@ class Summary:
     learned: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """The summary as plain values. `truth` and the fields after `verdict` are left out where they are empty."""
+        """The summary as plain values. `truth` and the fields after `verdict` are left out if empty or None."""
         content = asdict(self)
         content["verdict"] = self.verdict.value
         optional = (
@@ -175,7 +175,7 @@ class _OfMap(NamedTuple):
     valid: float
     fog: FogEstimate
     errors: tuple[Errors, Errors] | None
-    """Errors of stripe and depth, where the truth is known."""
+    """Errors of stripe and depth; None if the truth is not known."""
     doubts: tuple[str, ...]
 
 
@@ -198,7 +198,7 @@ class MapTally:
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """Reasons against maps, each with its maps; empty if there are none."""
+        """Reasons against maps, each with the maps concerned."""
         of_reason: dict[str, list[int]] = {}
         for index, each in enumerate(self._maps):
             for reason in each.doubts:

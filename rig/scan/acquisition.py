@@ -1,8 +1,8 @@
 """Runs a scan: starts the devices in order, takes maps from their frames, and makes everything safe.
 
 The `Pipeline` works between SPAD and caller. When all frames have come, or anything fails, the rig is made safe on the
-caller's thread. Frames that are still in the ring buffer then are counted and estimated, unless the caller's thread
-itself failed.
+caller's thread. Frames that are left in the ring buffer at that time are still counted and estimated, unless the
+caller's thread itself failed.
 """
 
 import logging
@@ -71,11 +71,11 @@ class AcquisitionRequest:
 class Acquisition:
     """A scan with an open rig. Iterate once over `run()`.
 
-    plan, timing: from `rig.devices.prepare`. maker: makes the maps, on the counting thread; a
+    plan, timing: from `rig.devices.prepare`. maker: makes the maps, on the counting thread, such as a
     `rig.depth.reconstruct.Reconstructor`.
 
     Raises UsageError if the SPAD cannot do what the policy asks, ValueError for less than one map, and PlanError if the
-    memory of a SPAD is too small for a map (not checked in a replay).
+    SPAD's memory is too small for a map (not checked in a replay).
     """
 
     def __init__(
@@ -114,7 +114,8 @@ class Acquisition:
         """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
         Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if a block cannot be
-        written; all maps that are still complete come first. Raises DevicesError if not all devices could be made safe.
+        written; maps that are complete all the same come first. Raises DevicesError if not all devices could be made
+        safe; after another error, notes on that error say so instead.
         """
         plan = self._plan
         counter = self._maker.counter(
@@ -159,8 +160,7 @@ class Acquisition:
         keeps_time = isinstance(rig.spad, ReplaySpad) and rig.spad.pace.speed is not None
         ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
-        on_frame = None if rig.guard is None else rig.guard.beat
-        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, self._on_frame)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
@@ -182,8 +182,7 @@ class Acquisition:
                     try:
                         if rig.guard is not None and rig.guard.failure is not None:
                             raise rig.guard.failure
-                        if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
-                            raise DeviceFault(fault)
+                        self._require_scanner()  # the SPAD may be silent
                     except DeviceError as error:
                         pipeline.end_source(error)  # no wait: the SPAD itself may be silent
                         break
@@ -208,8 +207,19 @@ class Acquisition:
         finally:
             self._end_start(pipeline, assembler)
 
+    def _on_frame(self, frame: int) -> None:
+        """Tell the guard of the frame, and end the run if the scanner has failed. Runs on the SPAD's thread."""
+        if self._rig.guard is not None:
+            self._rig.guard.beat(frame)
+        self._require_scanner()
+
+    def _require_scanner(self) -> None:
+        """Raise DeviceFault if the scanner has failed: frames would go on without markers."""
+        if (fault := self._rig.scanner.status.fault) is not None:
+            raise DeviceFault(fault)
+
     def _guard_limits(self, sweeps: int) -> GuardLimits:
-        """The laser guard's time limits for this start. They allow for a burst, silent until it is read out."""
+        """The laser guard's time limits for this start. In a burst they allow for silence until it is read out."""
         usual, plan = GuardLimits(), self._plan
         block_s = 3 * self._timing.stride / plan.link_bytes_per_s if plan.link_bytes_per_s else 0.0
         exposed_s = (self._burst_frames(sweeps) or 0) / float(plan.frame_rate_hz)
@@ -255,8 +265,8 @@ class Acquisition:
         return "rendering" if isinstance(self._rig.clock, VirtualClock) else "scanning"
 
     def _arm_laser(self) -> None:
-        """Arm the laser while the gate reads back low, and wait until it is warm. The SPAD, which may overflow, starts
-        later."""
+        """Set the gate low, arm the laser and wait until it is warm. Raises DeviceTimeout after WARM_UP_S. The SPAD
+        starts later, since its frames would overflow the ring meanwhile."""
         self._rig.sync.gate_low()
         laser, power_w = self._rig.laser, self._rig.config.scan.power
         laser.arm(laser.limits.max_power_w if power_w is None else power_w)

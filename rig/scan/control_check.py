@@ -1,9 +1,9 @@
 """Compares what drivers sent to their devices in a replay with the recording: the commands, and when each was sent.
 
 Commands are compared byte by byte. For buffers of points the time is compared too: how much later than in the recording
-each was sent, relative to the median over its scan, since the host chooses when a scan begins. The host's timing also
-decides at which point a scan was stopped. So a last buffer that only one of the two had sent is not compared, nor how
-the mirror was parked.
+each was sent, less the median over its scan, since the host chooses when a scan begins. The host's timing also decides
+at which point a scan was stopped. So a last buffer that was sent in the replay only, or in the recording only, is not
+compared, nor how the mirror was parked.
 """
 
 import statistics
@@ -17,7 +17,7 @@ from drivers.transports.tap import Passed, read_taps
 SWAP_TOLERANCE_S = 2e-3
 """Longest time by which a buffer may come earlier or later than in the recording."""
 STOP_BUFFERS = 1
-"""Buffers that one of two scans may have sent more than the other before it was stopped."""
+"""Number of buffers by which recorded and replayed scan may differ at their ends."""
 _SHOWN = 24
 """Bytes of a command that are shown."""
 
@@ -44,7 +44,7 @@ class ControlCheck:
 
 
 def check_control(recorded: Path, now: Path, *, devices: Sequence[str], tolerance_s: float | None) -> ControlCheck:
-    """Compare two files of control traffic.
+    """Compare two files of control traffic: the recorded one, and that of the replay, which counts as empty if missing.
 
     devices: those whose drivers took part in the replay. tolerance_s: most by which a buffer may come too early or too
     late; None allows any time. Raises ProtocolError if a file is not one of control traffic.
@@ -72,7 +72,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
 
 
 def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
-    """Describe the first difference: another byte, or more than `tail` commands missing at the end. None if none."""
+    """Describe the first difference: another byte, or over `tail` commands missing or added at the end; else None."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
             pairs = enumerate(zip(old.data, new.data, strict=False))
@@ -92,7 +92,7 @@ def _first_difference(device: str, what: str, said: list[Passed], says: list[Pas
 def _swaps_off(said: list[Passed], says: list[Passed]) -> list[float]:
     """Seconds by which each buffer came later than recorded, less the median of its scan.
 
-    The second buffer gets 0: a device takes it as soon as the host has it, so its time is not the device's.
+    The second buffer gets 0: a device takes it as soon as the host has it, so its time depends on the host alone.
     """
     late_s = [(new.t_ns - old.t_ns) / 1e9 for old, new in zip(said, says, strict=False)]
     timed_s = late_s[:1] + late_s[2:]

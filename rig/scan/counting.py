@@ -1,4 +1,4 @@
-"""The counting thread, which turns blocks into maps. It alone counts and estimates, one sweep after the other.
+"""The counting thread, which turns blocks into maps: it counts sweep after sweep, and `MapsAtOnce` makes the maps.
 
 `MapQueue` is the bounded queue of maps from this thread to the caller. It also tells the caller when the frames have
 ended.
@@ -27,8 +27,8 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), mean fractional column of each column's frames; its centre if it has none. compute_s:
-    time of binding, counting and estimation, see `SharedTime`.
+    column: float64 (columns,), mean fractional column of each column's frames; its own number if it has none.
+    compute_s: seconds of binding, counting and estimation, see `SharedTime`.
     """
 
     sweep: SweepAccount
@@ -38,7 +38,7 @@ class AcquiredMap:
 
 
 class MapQueue:
-    """At most `room` maps that wait for the caller. One thread puts maps, another takes them; any may end the stream.
+    """At most `room` maps that wait for the caller. One thread puts maps, one takes them; any may end the stream.
 
     streaming: whether the rig still has to be kept running.
     closed: whether nobody will take maps any more.
@@ -56,7 +56,7 @@ class MapQueue:
 
     @property
     def drained(self) -> bool:
-        """Whether every map was taken and none will come."""
+        """Whether every map was taken and no more will come."""
         return self._ended and not self._maps
 
     def put(self, found: AcquiredMap) -> None:
@@ -91,7 +91,7 @@ class MapQueue:
         return self._take(timeout_s, lambda: not self.streaming)
 
     def take_rest(self, timeout_s: float) -> AcquiredMap | None:
-        """The next map; None after `timeout_s`, or at once if none will come."""
+        """The next map; None after `timeout_s`, or at once if no more will come."""
         return self._take(timeout_s, lambda: self.drained)
 
     def _take(self, timeout_s: float, over: Callable[[], bool]) -> AcquiredMap | None:
@@ -172,7 +172,7 @@ class CountingThread:
                 pass
         except BaseException as error:
             self.error = self.error or error
-        # This thread and the pipeline refer to each other: their memory, hundreds of megabytes, must not wait for that.
+        # This thread and the pipeline refer to each other: hundreds of megabytes must not wait for garbage collection.
         self._maps.close()
         del self._asked
         self._queue.end()

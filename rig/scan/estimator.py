@@ -1,9 +1,10 @@
-"""Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames, else `likelihood`. Finds
-what `joint` has learned in an earlier run.
+"""Chooses the estimator of a run with `auto`: `joint` wherever it keeps up with the frames and has memory enough, else
+`likelihood`. Finds what `joint` has learned in an earlier run.
 
-`joint` errs several times less than `likelihood` and takes longer. That does not matter if no frame waits for a map:
-with simulated rigs, recordings and cubes, and for a single map. In a stream a map must be made within the time of a
-sweep. How fast `joint` is on this machine and with these threads is measured just before the scan.
+`joint` errs several times less than `likelihood` and takes longer. Its time does not matter if no frame waits for a
+map: with a SPAD that can wait, such as a simulated one, with cubes, with recordings that are not played at a set speed,
+and for a single map. In a stream a map must be made within the time of a sweep. How fast `joint` is on this machine and
+with these threads is measured just before the scan.
 """
 
 import math
@@ -26,7 +27,7 @@ from rig.run_folder.folder import read_learned
 KEPT_UP = 0.5
 """Share of a sweep's time that a map of `joint` may take; the rest is for counting and for other load."""
 ROWS, COLUMNS = 128, 160
-"""Largest part of the picture whose map is timed. That takes some milliseconds."""
+"""Largest part of the picture whose map is timed. Its map takes some milliseconds."""
 EXPOSURES = 10
 TRIES = 3
 
@@ -34,7 +35,7 @@ TRIES = 3
 def choose_estimator(
     estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float = math.inf
 ) -> tuple[EstimateConfig, str]:
-    """Replace `auto` in the settings; returns them and the reason. Settings without `auto` are returned unchanged.
+    """Replace `auto` in the settings; returns them and the reason. Without `auto` they are unchanged, the reason empty.
 
     map_time_s: time in which a map must be made; infinite if no frame waits for it.
     """
@@ -72,11 +73,10 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
 
 
 def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tuple[RowModel | None, str]:
-    """The state of `joint` kept in a file by an earlier run, if it can be used here, else None and why not.
+    """The state of `joint` that an earlier run kept in a file and an empty text, or None and why no state can be used.
 
-    The text is empty without a file, and for other estimators.
-
-    Raises UsageError if the file is not readable, or its folder does not exist.
+    The text is also empty without a file, and for other estimators. Raises UsageError if the file is not readable, or
+    its folder does not exist.
     """
     from rig.estimate.row.em import path_bins
     from rig.estimate.search.online_learning import LearningSetting
@@ -100,7 +100,8 @@ def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tu
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:
     """Seconds from map to map of `joint` on this machine, measured on a part of the picture and scaled up.
 
-    Each thread makes a map, as in a stream. The first map, from which it learns, takes longer; so do maps with a halo.
+    Each thread makes a map, as in a stream. A run's first map, from which `joint` learns, takes longer; so do maps with
+    a halo.
     """
     from rig.estimate.joint.joint import Joint, MapWork
     from rig.estimate.row.em import start_model

@@ -3,7 +3,7 @@
 `Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and never
 delays other threads. It is an optional reader of the ring, sums the frames to show and gives the block back before it
 calls the callback. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
-hangs is abandoned when the SPAD has stopped. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
+still hangs at the end is abandoned. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
 import logging
@@ -66,8 +66,8 @@ class ScanProgress:
     sweeps: sweeps counted, of `maps`.
     stages: the figures of each stage so far.
     fog: estimate from the newest map; None before the first.
-    stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while it makes another
-      map; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
+    stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while other maps are made
+      and nothing is counted; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
     """
 
     frames: int
@@ -145,7 +145,7 @@ class Monitor:
                 _log.warning("the monitor ends: its callback raised %s", type(error).__name__, exc_info=error)
 
     def _show_next(self) -> bool:
-        """Show the newest block; False after the last one."""
+        """Show the newest block; False after the last one, or if the source failed."""
         try:
             block = self._reader.next()
         except Exception:  # of the source; the counting thread reports it
@@ -171,6 +171,6 @@ def add_frames(counts: NDArray[np.unsignedinteger], block: FrameBlock, first: in
     for a, b in pairwise([first, *moves.tolist(), end]):
         x0, y0 = (int(value) for value in corners[a])
         pixels = np.unpackbits(block.bits[a:b], axis=2, count=header.width)
-        # The last window of a row may end in the padding of the sensor.
+        # The last window of a row may end in the padding of the row.
         window = counts[y0 : y0 + header.height, x0 : x0 + header.width]
         window += pixels.sum(axis=0, dtype=counts.dtype)[: window.shape[0], : window.shape[1]]

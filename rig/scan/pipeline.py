@@ -1,8 +1,8 @@
 """The threads between a SPAD and the caller: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
 
 One pipeline serves one start of the SPAD. Nothing in it can wait for ever: the source waits for the ring, the ring for
-counting and recorder, counting for the caller, and `end_source` and `close` end each of these waits. Nothing ever waits
-for the monitor.
+counting and recorder, counting for the caller, and `end_source` and `close` end each of these waits. Nothing waits for
+the monitor, except `close`, for MONITOR_S at most.
 
 `Overload` is the user's policy for frames that come faster than they can be processed, and `ring_for` makes the ring
 that the policy asks for.
@@ -35,7 +35,7 @@ MONITOR_S = 0.5
 
 
 class Pipeline:
-    """The threads of one start of the SPAD: source -> ring -> {counting + estimation, recorder, monitor} -> maps.
+    """The threads of one start of the SPAD, see the module. maps: the queue of maps to the caller.
 
     recording: takes every block; None for no recorder. on_frame: as in `Source`.
     """
@@ -104,13 +104,13 @@ class Pipeline:
         self._source.end(why)
 
     def join_source(self) -> bool:
-        """Wait for the source thread after the SPAD was stopped; False if it hangs."""
+        """Wait for the source thread after the SPAD was stopped; False if it does not end within JOIN_S."""
         return self._source.join(JOIN_S)
 
     def error(self) -> BaseException | None:
         """The error that ended the drained pipeline too early, or None; waits until the recording is written.
 
-        If that takes longer than DRAIN_S, it is a RecordingError."""
+        If the recording is not written within DRAIN_S, the error is a RecordingError."""
         recorder = self._recorder
         if recorder is not None and not recorder.thread.join(DRAIN_S):
             return RecordingError(
@@ -122,7 +122,8 @@ class Pipeline:
         return self._counting.error
 
     def close(self) -> None:
-        """End all threads, whatever they are doing. Maps not taken are lost; what is left in the ring is recorded."""
+        """Tell all threads to end; wait for recorder, monitor and estimate, each for a limited time. Maps not taken are
+        lost; what is left in the ring is recorded."""
         try:
             self._source.end()
             self.maps.close()
@@ -142,7 +143,7 @@ class Pipeline:
 RING_BYTES = 512 * 2**20
 """Bytes of the ring of a source that cannot wait: 0.16 s of full frames at 100 kHz, longer than a pause of Python."""
 FEWEST_SLOTS = 8
-"""Least number of slots. A source that can wait gets just these, and so runs ahead by as many blocks."""
+"""Least number of slots. A source that can wait gets just these, and so runs ahead by as many blocks at most."""
 MOST_SLOTS = 1024
 
 
@@ -179,8 +180,7 @@ def ring_for(
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
-    keeps_time: whether a SPAD that can wait should rarely need to, as in a replay with a clock. It then gets a large
-      ring.
+    keeps_time: whether a SPAD that can wait gets a large ring, so that it rarely has to, as in a replay with a clock.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

@@ -1,4 +1,4 @@
-"""Makes depth maps, one by one, from a cube: frames without markers, in an array or an imported recording."""
+"""Makes depth maps from a cube: frames without markers, in an array or an imported recording."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,8 @@ def reconstruct_cube(
 ) -> RunResult:
     """Make all maps of a checked cube. Missing frames are noted as gaps. Raises UsageError if `out` cannot be written.
 
-    An interrupt ends the run after its last complete map, with verdict 'aborted'.
+    progress: called with maps done and the total. An interrupt ends the run after its last complete map, with verdict
+    'aborted'.
     """
     plan, model = cube.plan, calibration.model
     commands = column_commands(plan)

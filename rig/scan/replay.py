@@ -37,7 +37,8 @@ def play(
 
     If drivers take part and the recording has control traffic, what they sent is compared with that traffic once the
     rig is closed, also after a failure. It is not compared if the recorded scan had planned another number of sweeps.
-    Raises DivergedError if the two differ; what the run wrote is kept.
+    Times are compared only if the whole recording was played in real time. Raises DivergedError if the two differ; what
+    the run wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()
@@ -70,8 +71,8 @@ def play(
 
 
 def _asks_for_the_same(recording: RunRecording, maps: int | None) -> bool:
-    """Whether a replay plans as many sweeps as the recorded scan did. If not, that is logged: either `maps` is another
-    number (None: all of the recording), or the recorded scan ended before its last sweep.
+    """Whether a replay plans as many sweeps as the recorded scan did, or the recording does not tell. If not, that is
+    logged: either `maps` is another number (None: all), or the recorded scan ended before its last sweep.
     """
     manifest = read_manifest(recording.path) or {}
     told = sum(int(start["sweeps"]) for start in (manifest.get("recording") or {}).get("starts") or [])
@@ -90,8 +91,9 @@ def _check(recording: Path, tap: TapFile, drivers: Sequence[str], tolerance_s: f
 
 
 def _require_no_difference(recording: Path, tap: TapFile, drivers: Sequence[str], error: Exception) -> None:
-    """Raise DivergedError if a replay that failed had sent other bytes. Commands missing at its end are ignored."""
-    problems = [one for one in _check(recording, tap, drivers, None).problems if "byte" in one]
+    """Raise DivergedError if a replay that failed had sent other bytes. Commands missing or added at its end are
+    ignored."""
+    problems = [one for one in _check(recording, tap, drivers, None).problems if ": byte " in one]
     if problems:
         raise _diverged((*problems, str(error)), None) from error
 

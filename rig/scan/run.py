@@ -48,9 +48,7 @@ class RunResult:
     control: ControlCheck | None = None
 
     def uninterrupted(self) -> Self:
-        """Return the result itself, for callers that need the whole run. Raises KeyboardInterrupt if an interrupt ended
-        it.
-        """
+        """The result itself, for callers that need the whole run. Raises KeyboardInterrupt if an interrupt ended it."""
         if self.summary.verdict is RunVerdict.ABORTED:
             raise KeyboardInterrupt
         return self
@@ -61,8 +59,8 @@ class Run:
 
     Leaving the context without `finish` removes everything that was written, except a recording that contains a block.
 
-    out: folder; None writes nothing. record: whether the folder is that of a recording.
-    rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
+    out: folder; None writes nothing. save: which maps are written; None for all. record: whether the folder is that of
+    a recording. rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
     """
 
     def __init__(
@@ -170,8 +168,7 @@ class Run:
             raise
 
     def finish(self, summary: Summary, manifest: Mapping[str, Any]) -> RunResult:
-        """Write manifest and summary and make the folder appear. Without a map or a recorded block no folder is
-        left."""
+        """Write manifest and summary and make the folder appear. With neither map nor recorded block none is left."""
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:

@@ -60,12 +60,12 @@ def run_scan(
 ) -> RunResult:
     """Scan with an open rig; `run` takes the maps.
 
-    request: its `maps` (None takes all maps of a recording that replaces the SPAD), `on_overload`, `record` and
-      `accept_calibration` are used; its other fields were used to open the rig and to make `run`.
+    request: its `maps` (None: all maps in a replay, else one), `on_overload`, `record` and `accept_calibration` are
+      used; its other fields were used to open the rig and to make `run`.
     prepared: the result of `prepare` for this rig, if the caller has called it.
 
-    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does an error, which is raised
-    again once the complete maps and the recording are safe; if there is neither, nothing is left.
+    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does a DeviceError or RigError,
+    which is raised again once the complete maps and the recording are safe; if there is neither, nothing is left.
     """
     policy = Overload.parse(request.on_overload)
     require_policy(policy, rig.spad.info)
@@ -171,7 +171,7 @@ def run_scan(
 
 
 def _keep_learned(estimate: EstimateConfig, state: Learned) -> None:
-    """Keep a state for the next run, if the config names a file for it."""
+    """Keep a state of `joint` for the next run, if the config names a file for it. Logs if that cannot be written."""
     if estimate.learned is None or estimate.estimator != "joint":
         return
     try:
@@ -183,8 +183,8 @@ def _keep_learned(estimate: EstimateConfig, state: Learned) -> None:
 class LiveFacts:
     """Facts about a live scan, for `run_scan`. `ReplayFacts` has those about a recording.
 
-    maps: number of maps that the run will take. learned: states of the estimator to begin with. starts: None lets the
-    scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
+    maps: number of maps that the run will take. learned: kept states to estimate the maps with, none here. starts: None
+    lets the scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
     """
 
     command = "scan"
@@ -202,8 +202,8 @@ class LiveFacts:
         return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
-        """Truth for a sweep bound to `column`, if the world knows it. The world is asked only after the estimate, which
-        must never see the truth.
+        """Truth for a sweep bound to `column`; None without a simulated world. The world is asked only after the
+        estimate, which must never see the truth.
         """
         if self._rig.world is None:
             return None
@@ -228,7 +228,7 @@ def recording_space(
     """Room that the frames and the maps of a recorded scan take at most, and the room on the disk of its folder."""
     request, rate_hz, starts = spad_request(rig.config.scan, plan), float(plan.frame_rate_hz), facts.count_starts()
     spare_s = lead_s(rig) + spare_lead_s(rig)  # of each start, before its first marker and after its last one
-    if rig.spad.info.can_wait:  # on virtual time the SPAD may be a whole ring ahead of what is counted
+    if rig.spad.info.can_wait:  # such a SPAD may be a whole ring ahead of what is counted
         spare_s += FEWEST_SLOTS * request.block_frames / rate_hz
     frames = plan.frames_for(facts.maps) + (starts - 1) * plan.frames_for(0) + starts * spare_s * rate_hz
     if plan.burst_frames is not None:

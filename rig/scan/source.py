@@ -11,7 +11,7 @@ from drivers.ring import BlockRing, RingReader
 from rig.threads import StageThread
 
 LOOK_S = 0.02
-"""Time from one look at what goes on meanwhile to the next."""
+"""Time from one call of `meanwhile` to the next while `blocks` waits."""
 HANG_S = 180.0
 """Longest wait, in seconds, for a SPAD whose `fill` neither returns nor raises DeviceTimeout."""
 
@@ -55,9 +55,8 @@ class Source:
         return max(0.0, self._busy_s - self._ring.waited_s)
 
     def end(self, why: BaseException | None = None) -> None:
-        """Stop filling after the present block. May be called from any thread; returns at once. why: error for the
-        readers.
-        """
+        """Stop filling after the present block; returns at once. May be called from any thread. why: error for the
+        readers."""
         self._why = self._why or why
         self._over.set()
         self._ring.end_waits()
@@ -100,8 +99,8 @@ def blocks(
     """Yield the blocks of one start of the SPAD, then raise the source's error, if there is one.
 
     Raises DeviceTimeout if no block comes: the SPAD's error if the SPAD says that it has no frames, else the ring's
-    after HANG_S. silence_s: longest wait for a block before it is asked whether the SPAD has said so. meanwhile: called
-    before each wait, and every LOOK_S of it as long as it returns True.
+    after HANG_S. silence_s: wait for a block after which `source.silences` is read. meanwhile: called before each wait;
+    as long as it returns True, waits last LOOK_S at most.
     """
     while True:
         heard = len(source.silences)

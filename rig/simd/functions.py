@@ -69,7 +69,7 @@ power_of_two = emitted(FLOAT32(FLOAT32), _power)
 
 @numba.njit(forceinline=True)
 def logarithm(a):  # type: ignore[no-untyped-def]
-    """Natural logarithm of positive lanes. Error: 2e-7 where |logarithm| < 1, else 2e-7 of the logarithm."""
+    """Natural logarithm of lanes of at least 1.2e-38. Error: 2e-7 where |logarithm| < 1, else 2e-7 of the logarithm."""
     part = mantissas(a)
     ratio = (part - 1.0) / (part + 1.0)
     square = ratio * ratio

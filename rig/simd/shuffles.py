@@ -110,7 +110,7 @@ def _lanes_between(builder: Any, first: Any, end: Any) -> Any:
 
 
 lanes_between = emitted(INT16(types.int64, types.int64), _lanes_between)
-"""lanes_between(first, end): all bits of lanes first to end - 1 set, the others' clear; 16-bit lanes."""
+"""lanes_between(first, end): all bits set in lanes first to end - 1, no others; 16-bit lanes."""
 equal_bytes = emitted(types.uint32(BYTES, types.uint8), _bits_where)
 """equal_bytes(a, number): bit i is set where byte i equals the number."""
 first_equal = emitted(
@@ -183,7 +183,7 @@ def _store_folded(builder: Any, address: Any, row: Any, a: Any) -> None:
 
 
 store_folded = emitted(types.void(types.intp, types.intp, FLOAT32), _store_folded)
-"""store_folded(address, row, a): write the lower half of 16 float32 plus the upper half, as row number `row` there."""
+"""store_folded(address, row, a): write the sums of the lower and upper half of 16 float32 as row `row` there."""
 
 
 def _totals_of_rows(builder: Any, address: Any) -> Any:
@@ -201,7 +201,7 @@ _EIGHT_FLOATS = ir.VectorType(ir.FloatType(), EIGHT)
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """The columns of eight rows of eight numbers. All steps but the last move numbers within half a vector: quicker."""
+    """The columns of eight rows of eight numbers. Only the last step goes beyond half a vector, which is slower."""
 
     def mixed(a: Any, b: Any, places: list[int]) -> Any:
         return builder.shuffle_vector(a, b, place_list([*places, *(i + EIGHT // 2 for i in places)]))

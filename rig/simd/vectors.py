@@ -95,7 +95,7 @@ def called(builder: Any, name: str, result: Any, *args: Any) -> Any:
 
 
 def emitted(signature: Any, emit: Callable[..., Any]) -> Any:
-    """An intrinsic of that signature. emit(builder, *arguments) writes its LLVM code and returns the result, if any."""
+    """An intrinsic of this signature. emit(builder, *arguments) writes its LLVM code and returns the result, if any."""
 
     def operation(typing: Any, *types_given: Any) -> VectorCode:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -135,7 +135,7 @@ def _is_real(value: Any) -> bool:
     return isinstance(value.type.element, ir.FloatType)
 
 
-# Products and sums may be fused ("contract"): every machine with the same instructions gives the same bits.
+# Products and sums may be fused ("contract"). Machines with the same instructions still give the same bits.
 _add = _binary(lambda b, x, y: b.fadd(x, y, flags=("contract",)) if _is_real(x) else b.add(x, y))
 _sub = _binary(lambda b, x, y: b.fsub(x, y, flags=("contract",)) if _is_real(x) else b.sub(x, y))
 _mul = _binary(lambda b, x, y: b.fmul(x, y, flags=("contract",)) if _is_real(x) else b.mul(x, y))
@@ -145,13 +145,13 @@ add_saturated = _named("sadd.sat")
 sub_saturated = _named("ssub.sat")
 """sub_saturated(a, b): signed difference that stops at the limits of the type."""
 larger = _named("smax")
-"""larger(a, b): the larger one of two integers in each lane."""
+"""larger(a, b): the larger one of two signed integers in each lane."""
 larger_float = _named("maxnum")
-"""larger_float(a, b): the larger one of two float32 in each lane."""
+"""larger_float(a, b): the larger one of two float32 in each lane, ignoring a NaN."""
 smaller = _named("smin")
-"""smaller(a, b): the smaller one of two integers in each lane."""
+"""smaller(a, b): the smaller one of two signed integers in each lane."""
 smaller_float = _named("minnum")
-"""smaller_float(a, b): the smaller one of two float32 in each lane."""
+"""smaller_float(a, b): the smaller one of two float32 in each lane, ignoring a NaN."""
 
 add_saturated_unsigned = _named("uadd.sat")
 """add_saturated_unsigned(a, b): sum of unsigned integers that stops at the largest of the type."""
@@ -200,7 +200,7 @@ square_root = emitted(FLOAT32(FLOAT32), lambda b, a: called(b, f"llvm.sqrt.{vect
 
 
 def _has_avx2() -> bool:
-    """Whether the processor that numba compiles for has AVX2: this one, or the one that numba's settings name."""
+    """Whether this processor has AVX2; if numba's settings name one, whether they list AVX2 among its features."""
     settings: Any = config
     if settings.CPU_NAME is None and settings.CPU_FEATURES is None:
         return bool(binding.get_host_cpu_features().get("avx2", False))

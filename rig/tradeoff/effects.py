@@ -163,7 +163,8 @@ def _mirror_command(config: RigConfig, column: int) -> float:
 
 @contextmanager
 def open_world(config: RigConfig) -> Iterator[tuple[ReportsEffects, float]]:
-    """Open the config's world with its simulated devices, planned for its scan; also gives the scan's power in W."""
+    """Open the config's world with its simulated devices, planned for its scan; also gives the scan's power in W.
+    Raises UsageError if there is no world or power, or if the world cannot be made or does not report effects."""
     if config.world is None:
         raise UsageError(f"{config.name} has no simulated world; name a config that has one, such as 'simulated'")
     with ExitStack() as stack:

@@ -165,7 +165,7 @@ ROWS = 200
 COUPLED = "joint"
 """The estimator that sees a row together with its neighbours; the median filter sees as many rows."""
 LEAST_WRONG = 0.003
-"""Least share of the ideal estimator's answers more than 1 px off, for a ratio: twenty of 200 rows x 32 draws."""
+"""A ratio needs at least this share of the ideal estimator's answers more than 1 px off: 20 of 200 rows x 32 draws."""
 LOCAL_SDS = 3.0
 """Standard deviations of the bound that must fit into LOCAL_PX, so that nearly all right answers lie within it."""
 
@@ -236,7 +236,8 @@ SERIES_BELOW: Final = 0.05
 def chernoff_exponent(flux: Array, other: Array) -> Array:
     """Chernoff's exponent C per exposure between rows of light `flux` and `other`, (..., pixels) each; 0 if equal.
 
-    The probability that `other` is the likelier one although `flux` is true, or the reverse, is at most exp(-K C).
+    After K exposures `other` is the likelier one although `flux` is true, or the reverse, with a probability of at most
+    exp(-K C).
     """
     first, second = np.broadcast_arrays(np.maximum(flux, FLUX_MIN), np.maximum(other, FLUX_MIN))
     low, high = np.minimum(first, second), np.maximum(first, second)

@@ -76,7 +76,7 @@ class Tradeoff:
         return of + advice(self.rows, self.wish, self.answer)
 
     def as_json(self) -> dict[str, Any]:
-        """The result as plain values; `answer` only if a setting was asked for."""
+        """The result as plain values; `answer` only if there was a wish."""
         content: dict[str, Any] = {
             "advice": self.advice,
             "rows": [asdict(row) for row in self.rows],

@@ -1,1 +1,1 @@
-"""The simulated devices. They have the interfaces of the real ones and share one bench."""
+"""The simulated devices. They have the interfaces of the real ones and share one `sim_backend.bench.Bench`."""

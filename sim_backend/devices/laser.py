@@ -1,4 +1,4 @@
-"""The simulated line laser: tells the bench how much it emits."""
+"""The simulated line laser: tells the bench, the state that simulated devices share, how much it emits."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -20,7 +20,7 @@ class SimulatedLaserConfig(KindConfig):
 
 
 def create(config: SimulatedLaserConfig, surroundings: Surroundings) -> PlainLaser:
-    """The laser on the world's bench."""
+    """The laser, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
     return PlainLaser("simulated laser", config.max_power, bench_of(surroundings).emit)
 
 

@@ -36,7 +36,7 @@ class SimulatedScannerConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 20e-6
-    """Relative error of the scanner's crystal."""
+    """Relative error of the scanner's crystal, positive if it runs fast."""
     start_latency: Annotated[Seconds, Field(ge=0)] = 1.3373e-3
     """Time from `start` to the first point. The default is not a whole number of frame periods."""
     jitter: float = Field(default=0.0, ge=0, le=0.1)
@@ -47,7 +47,7 @@ class SimulatedScannerConfig(KindConfig):
 
 
 class SimulatedScanner(BeamScanner):
-    """Tells the bench where the mirror goes."""
+    """Tells the bench, the state that simulated devices share, where the mirror goes."""
 
     def __init__(self, config: SimulatedScannerConfig, bench: Bench) -> None:
         super().__init__("simulated scanner")
@@ -94,7 +94,7 @@ class SimulatedScanner(BeamScanner):
 
 
 def create(config: SimulatedScannerConfig, surroundings: Surroundings) -> SimulatedScanner:
-    """The scanner on the world's bench."""
+    """The scanner, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
     bench = bench_of(surroundings)
     bench.jitter = Jitter(config.jitter, surroundings.seed)
     forward_us, backward_us = 1e6 * bench.lag.forward, 1e6 * bench.lag.backward

@@ -1,11 +1,11 @@
-"""The simulated SPAD array: asks the bench what happened during its frames and draws them, block by block.
+"""The simulated SPAD array: asks the world's bench what happened during its frames and draws them, block by block.
 
 On a `VirtualClock` time passes as frames are made; on any other clock a block comes when the period of its last frame
 is over.
 
-On the way to the computer some frames get lost, which leaves a gap. Others are replaced by a copy of the
-previous frame of their block: its pixels, markers, counters and ticks. A copy keeps the number of the frame that it
-replaces, so only its ticks show it. The seed and the frame number determine which frames are lost or replaced.
+If the config says so, some frames get lost on the way to the computer, which leaves a gap, and others are replaced by a
+copy of the previous frame of their block: its pixels, markers, counters and ticks. A copy keeps the number of the frame
+that it replaces, so only its ticks give it away. Chance depends on the seed and the frame number alone.
 
 The tick counter runs on its own crystal (`clock_error`, `clock_wander`). At time t its rate has the relative error y, a
 constant plus a random walk W:
@@ -49,7 +49,7 @@ STEP_S = 1e-3
 
 
 class MarkerInputs:
-    """Counts marker edges since START. The counters of a frame include the edges that fall into its period.
+    """Counts marker edges since the run's start. The counters of a frame include the edges that fall into its period.
 
     A scan marker sets the line counter to 0; a line marker at the same time counts as the first of the new sweep.
     """
@@ -62,8 +62,8 @@ class MarkerInputs:
         """Fill marks, line and sweep in the records of consecutive frames that start at start_s (n,), about one period
         apart.
 
-        Returns the number of scan markers since START, up to and including the first frame. The records hold only the
-        lowest 16 bits of such numbers.
+        Returns the number of scan markers since the run's start, up to and including the first frame. The records hold
+        only the lowest 16 bits of the counters.
         """
         lit = np.where(state.edge, int(Mark.GATE_EDGE), np.where(state.share > 0, int(Mark.GATE_HIGH), 0))
         marks = lit | np.where(state.backward, int(Mark.BACKWARD), 0)
@@ -86,7 +86,7 @@ class MarkerInputs:
 
 
 def windows_at(window: WindowTable | None, first_sweep: int, records: NDArray[np.void]) -> NDArray[np.int32]:
-    """First pixel of each frame's window (n,), 0 without a table. first_sweep: what `MarkerInputs.record` returned."""
+    """First pixel of each frame's window (n,); zeros without a table. first_sweep: from `MarkerInputs.record`."""
     if window is None:
         return np.zeros(len(records), np.int32)
     since = first_sweep + ((records["sweep"].astype(np.int64) - first_sweep) & 0xFFFF)
@@ -144,7 +144,7 @@ class SimulatedSpadConfig(KindConfig):
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
     link: Annotated[BytesPerSecond, Field(gt=0)] = 8e9
-    """Bytes per second that the link to the computer carries. If full frames need more, only each row's window is sent.
+    """Bytes per second that the link to the computer carries. If full frames need more, scans use moving windows.
     The default is more than 512 x 512 pixels at 100 kHz need."""
     lost_frames: tuple[int, ...] = ()
     """Numbers of frames that get lost on the way, for testing gaps."""
@@ -153,7 +153,7 @@ class SimulatedSpadConfig(KindConfig):
     duplicate_probability: float = Field(default=0.0, ge=0, le=1)
     """Probability that a frame, other than the first of a block, is replaced by a copy of the one before it."""
     clock_error: Annotated[Ppm, Field(ge=-1e-3, le=1e-3)] = 0.0
-    """Relative error of the crystal."""
+    """Relative error of the crystal, positive if it runs fast."""
     clock_wander: Annotated[Ppm, Field(ge=0, le=1e-3)] = 0.0
     """Standard deviation of the change of that error in one second; it grows with the square root of time."""
     serial: str = Field(default="SIM-0001", min_length=1)
@@ -225,7 +225,7 @@ class SimulatedSpad(SpadArray):
     def _do_start(self, n_frames: int | None) -> None:
         clock = self._world.bench.clock
         tick_hz = self._timing.tick_hz
-        # The counter runs since the bench was set up; a run starts at its next tick.
+        # Ticks are counted from the clock's 0; a run starts at the next one.
         self._t0_ticks = -(-clock.now_ns() * tick_hz.numerator // (NS_PER_S * tick_hz.denominator))
         start_s = float(self._t0_ticks / tick_hz - Fraction(self._world.bench.clock_ns(0.0), NS_PER_S))
         self._world.bench.spad_start_s = start_s
@@ -269,9 +269,8 @@ class SimulatedSpad(SpadArray):
         return self._info.width if self._window is None else self._window.width_px
 
     def _frames_ahead(self) -> tuple[int, bool]:
-        """The number of frames that the next block holds, and False; or the number of the next frames that get lost,
-        and True.
-        """
+        """How many of the next frames go into one block, and False; or if the next frame gets lost, how many in a row
+        get lost, and True."""
         first = self._next_frame
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
         lost = dropped_frames(np.uint64(self._random_seed), first, n, self._config.loss_probability)
@@ -319,9 +318,8 @@ class SimulatedSpad(SpadArray):
         self._just_lost = False
 
     def _repeat(self, records: NDArray[np.void], bits: NDArray[np.uint8]) -> None:
-        """Replace frames of a block, drawn with `duplicate_probability`, each by the one before it. The first is never
-        replaced, since the one before it is not in this buffer.
-        """
+        """Replace each frame of a block, with probability `duplicate_probability`, by the one before it. The first is
+        never replaced, since the frame before it is not in this buffer."""
         chance = self._config.duplicate_probability
         twice = dropped_frames(np.uint64(self._random_seed) ^ _TWICE, self._next_frame, len(records), chance)
         for i in np.flatnonzero(twice[1:]) + 1:
@@ -337,7 +335,7 @@ class SimulatedSpad(SpadArray):
         self._photons.expose(number, held[first:], power_w[first:], x0[first:], bits, start_s[first:])
 
     def _advance(self, n: int, *, lost: int) -> None:
-        """Let the time of n frames pass."""
+        """Count n frames as exposed, `lost` of them as lost, and let their time pass."""
         self._next_frame += n
         old = self._counters
         exposed, all_lost = self._next_frame, (old.lost or 0) + lost
@@ -371,7 +369,7 @@ class SimulatedSpad(SpadArray):
         )
 
     def _frames(self, n: int) -> tuple[Array, BenchState]:
-        """Start of each of the next n frames in seconds of the bench, and what happens during them."""
+        """Start of each of the next n frames in seconds of the bench, and the bench's state during them."""
         period_ticks = self._timing.frame_period_ticks
         start_s = self._ticks.times_s(self._next_frame * period_ticks, period_ticks, n + 1)
         self._end_s = float(start_s[n])

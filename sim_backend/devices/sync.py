@@ -22,7 +22,7 @@ class SimulatedSyncConfig(KindConfig):
 
 
 class SimulatedSync(SyncSource):
-    """Tells the bench what the gate does."""
+    """Tells the bench, the state that simulated devices share, what the gate does."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__("simulated sync")
@@ -58,7 +58,7 @@ class SimulatedSync(SyncSource):
 
 
 def create(config: SimulatedSyncConfig, surroundings: Surroundings) -> SimulatedSync:
-    """The sync source on the world's bench."""
+    """The sync source, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
     return SimulatedSync(bench_of(surroundings))
 
 

@@ -6,11 +6,11 @@ exactly once, the band is a quadrature over the sheet, with no approximation: at
     k(x) = w t  int dphi/cos(phi) ds  p(angle) cos(arrival) / d^2 exp(-t (way - 1)),      ballistic line = 1
 
 for light that leaves the sheet at the share s of the depth, phi up or down in the fan, and reaches the wall after d
-(p: phase function, w: scattering over extinction; lengths in depths of the wall). Light scattered n times on its way is
-the n-fold convolution of k over n!, as in the small-angle theory of image transfer (Wells, "Loss of resolution in water
-as a result of multiple small-angle scattering", J. Opt. Soc. Am. 59, 686, 1969). Contributions of the lobes of a phase
-function add up in the exponent, and by reciprocity the way back to the camera spreads light as much as the way there.
-So the stripe's halo is F^-1[exp(2 F[k]) - 1] times the stripe.
+(p: phase function, w: scattering over extinction, way: whole path; lengths in depths of the wall). Light scattered n
+times on its way is the n-fold convolution of k over n!, as in the small-angle theory of image transfer (Wells, "Loss of
+resolution in water as a result of multiple small-angle scattering", J. Opt. Soc. Am. 59, 686, 1969). Contributions of
+the lobes of a phase function add up in the exponent, and by reciprocity the way back to the camera spreads light as
+much as the way there. So the stripe's halo is F^-1[exp(2 F[k]) - 1] times the stripe, F being the Fourier transform.
 
 The haze is spread likewise: light of every depth before the wall by the spread up to there, with weights 1/cos(arrival)
 since particles have no cosine law, and p(turn back)/p(180 degrees) for the angle that is left to turn back by. What is
@@ -18,8 +18,8 @@ spread across its end is the pedestal behind the stripe.
 
 Two corrections are fitted to traced rows (`tests.reference.tables.path_traced`), in which light also goes back and
 forth. With the reduced depth t* = w t (1 - mean cosine) (the similarity relation of transport theory), halo and
-spread haze grow by 1 + `HALO_GROWTH` t*^2 and 1 + `HAZE_GROWTH` t*^2. Light that the medium throws back to a wall of
-albedo `ALBEDO` adds `ALBEDO` sqrt(1 - mean cosine) times the k of an isotropic medium.
+spread haze grow by the factors 1 + `HALO_GROWTH` t*^2 and 1 + `HAZE_GROWTH` t*^2. Light that the medium throws back to
+a wall of albedo `ALBEDO` adds `ALBEDO` sqrt(1 - mean cosine) times the k of an isotropic medium.
 """
 
 import math
@@ -55,7 +55,7 @@ def phase(lobes: Lobes, cosine: Array | float) -> Array:
 
 
 def scattered_once(lobes: Lobes, share: float, haze: bool) -> Array:
-    """The band k of light scattered once, (`DEPTHS`, `PLACES`), per tangent; of a wall or of the haze."""
+    """The band k of light scattered once, of the haze or else of a wall: (depths, `PLACES`), per unit of tangent."""
     node, weight = np.polynomial.legendre.leggauss(NODES)
     # Cubes put nodes where most light comes from: near the wall, and near the row.
     node, weight = ((node + 1) / 2) ** 3, 1.5 * weight * ((node + 1) / 2) ** 2
@@ -72,10 +72,10 @@ def scattered_once(lobes: Lobes, share: float, haze: bool) -> Array:
 
 
 def shapes(lobes: Lobes, share: float, baseline: float) -> tuple[Array, Array, Array]:
-    """Light scattered more than once around the end of a sheet, each (`DEPTHS`, `PLACES`).
+    """Light scattered more than once around the end of a sheet, each (depths, `PLACES`).
 
-    baseline: optical depth from scanner to camera. Returns the halo per tangent, on either side, stripe = 1; and the
-    haze that is spread, before its end and behind it, haze at its end = 1.
+    share: scattering over extinction. baseline: optical depth from scanner to camera. Returns the halo per unit of
+    tangent, the same on both sides, stripe = 1; and the spread haze before its end and behind it, haze at its end = 1.
     """
     mean_cosine, depth = sum(w * g for w, g in lobes), DEPTHS[:, None]
     reduced = (share * depth * (1 - mean_cosine)) ** 2
@@ -113,6 +113,6 @@ def _row(spectrum: NDArray[np.complex128]) -> Array:
 
 
 def _log_haze(baseline: float, parallax: Array) -> Array:
-    """Logarithm of the light scattered once from where a sheet is seen at this parallax, but for an addend."""
+    """Logarithm of the light scattered once from where a sheet is seen at this parallax, up to a constant."""
     ray = np.hypot(1.0, parallax)
     return np.asarray(np.log(ray) - baseline / parallax * (1 + ray))

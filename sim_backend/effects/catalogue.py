@@ -17,15 +17,15 @@ code is a function that returns detections per second, float64 (rows, width). "b
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One effect: its name, what it acts on, its factory as module:name ("" if it is part of another), and the rule
-    that calls for it.
+    """One effect: its name, what it acts on, its factory as module:name ("" for kind "within"), and the rule that calls
+    for it.
 
-    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason in that case;
-    "" means that the sensor has no such effect.
+    why(setting): the reason in words why the effect is called for, None if it is not. absent: the reason why it is not
+    called for; "" means that the sensor has no such effect.
     of_sensor: light or counts that stay under a covered lens.
     changes(setting, planned_for), in closed form: the largest share of decisions on a row and column that can differ
     without the effect (may exceed 1). None: there is no closed form. The planner then evaluates the effect if it is
-    light that does not move or dark counts; any other effect is never left out.
+    dark counts or light that does not move, except the stripe; any other effect is never left out.
     """
 
     name: str
@@ -168,7 +168,7 @@ def _bit_errors_change(setting: Setting, planned_for: PlannedFor) -> float:
 
 DEVICES_OWN = ("galvo lag", "galvo jitter", "sheet bow", "row delay", "lost frames", "duplicated frames", "clock drift")
 MEASURED = "stripe"
-"""The effect without which there is nothing to decide."""
+"""Name of the effect without which there is nothing to decide."""
 _NO_MEDIUM = "the scene has no medium"
 _SURFACE = "each pixel has its albedo and its facet's tilt; part of the stripe and of ambient light"
 _FLAT = "a world is one depth per pixel: it lacks the sides nobody sees, from which light would come"

@@ -6,11 +6,11 @@ sees the radiance
 
     L = sigma_s p J |q| / (r |n.q|) exp(-sigma (r + z |q|)),      r = |z q - S| from the source S
 
-For a rectified rig of baseline b, with the rays q_p of the projector and q_c of the camera, all powers of z cancel:
-sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)), where I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The phase function
-is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein terms at the
-cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends: at the object, blurred by `sigma_px`, and in
-the sheet's own shadow along the row. The haze is simulated if the scene has a `medium`.
+For a rectified rig of baseline b, with the rays q_p = (u_p, v_p, 1) of the projector and q_c of the camera, all powers
+of z cancel: sigma_s p I0 du |q_p||q_c|/b exp(-sigma z (|q_p| + |q_c|)), where I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The
+phase function is constant (`backscatter`: scattering angles are all near 180 degrees) or a sum of Henyey-Greenstein
+terms at the cosine -(z q - S).q/(r |q|). The haze ends where the sheet's light ends; if that is a stripe, the end is
+blurred by `sigma_px`. The haze is simulated if the scene has a `medium`.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
 blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
@@ -36,8 +36,8 @@ REACH_SIGMAS = 5.0
 LEAST_INVERSE_DEPTH = 1e-12
 """Least inverse depth, in 1/m. Points that lie farther away or behind the camera get this value."""
 Numbers = tuple[tuple[NDArray[Any], ...], NDArray[Any], tuple[Any, ...], tuple[Any, ...]]
-"""The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), weight, |g| and
-sign of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
+"""The kernel's numbers, in one precision: rays u, v, |q| (rows, width) and source (3,); terms (n, 3), factor, |g| and
+sign of g of each Henyey-Greenstein term; halving, see `power_of_half`; 0, 1, 2 and least inverse depth."""
 
 
 class Haze:

@@ -1,10 +1,10 @@
 """Light that the medium scatters more than once: a halo around the stripe, and a pedestal under the whole row.
 
-`sim_backend.effects.beam_spread` has the physics. It gives the halo as a share of the ballistic stripe, and the haze
-that is spread beyond its end as a share of the haze there, by the angle to that end and by the optical depth t: half of
-that of the light's own way. Tables are made once for the medium and the rig (0.1 to 0.3 s). Between depths they are
-interpolated as shares of e^(2 t) - 1 and e^(1.5 t) - 1, which change little. Angles are pixels as in the middle of the
-picture. Light that is turned only a little (`forward_share`) counts as not scattered; it blurs the stripe itself.
+`sim_backend.effects.beam_spread` has the physics. It gives the halo as a share of the ballistic stripe, and the spread
+haze as a share of the haze at its end. Both depend on the angle from that end and on the optical depth t, which is half
+that of the light's whole way. Tables are made once for the medium and the rig (0.1 to 0.3 s). Between depths they are
+interpolated as shares of e^(2 t) - 1 and e^(1.5 t) - 1, which change little. Angles become pixels as in the middle of
+the picture. Light that is turned only a little (`forward_share`) counts as not scattered; it blurs the stripe itself.
 
 Against traced rows, levels in the ten pixels before and behind the stripe are right within 10 % up to an optical depth
 of 1 and within 20 % at 2 (docs/results/simulator.md). Cost: about 0.2 ms per mirror position for 512 x 512 pixels.
@@ -23,11 +23,11 @@ from sim_backend.effects.stripe import row_light
 from sim_backend.light.sheet import Arrays, LightSheet, Traced
 
 HALO_RISE, HAZE_RISE = 2.0, 1.5
-"""Exponents with which halo and spread haze rise with the optical depth, about."""
+"""Approximate exponents with which halo and spread haze rise with the optical depth."""
 FINER = 4
-"""Tables have so many depths for each of `DEPTHS`: the nearest one is taken, which is within 3 %."""
+"""Number of depths that tables have for each of `DEPTHS`. The nearest one is taken, which is within 3 %."""
 LEAST_COSINE = 0.1
-"""Smallest cosine of the angle between the sheet and the camera's axis that is used: no halo gets infinitely wide."""
+"""Smallest cosine of the angle between light and camera axis that is used, so that no halo gets infinitely wide."""
 LEAST_BASELINE_M = 1e-6
 Tables = tuple[NDArray[Any], ...]
 """Halo, haze before its end, haze behind it, by depth and distance in pixels; then the same for falling distances."""
@@ -66,9 +66,8 @@ class Halo:
 def _add_side(
     halo: NDArray[Any], haze: NDArray[Any], light: tuple[float, float], on: float, side: NDArray[Any]
 ) -> None:
-    """Add the light of halo and haze to the pixels on one side, between two neighbours of the tables. on: the second's
-    share.
-    """
+    """Add halo and spread haze to the pixels on one side, interpolated between two neighbours in the tables. light:
+    factors of halo and haze. on: share of the second neighbour."""
     a, b = np.float32(light[0] * (1.0 - on)), np.float32(light[1] * (1.0 - on))
     c, d = np.float32(light[0] * on), np.float32(light[1] * on)
     for i in range(len(side)):

@@ -2,8 +2,8 @@
 
 All surfaces are shifted together by D = velocity x time. A surface's facet m.X = 1 becomes m.(X - D) = 1, that is m /
 (1 + m.D), so the inverse depth of a ray q = (u, v, 1) is m.q / (1 + m.D) with m from the pixel that saw the point at
-time 0. That pixel is searched for from two starting points, the nearest surface and the surface seen there at time 0;
-the nearer result is used, which is right except for a pixel or two along edges. Newly uncovered areas continue the
+time 0. That pixel is searched for from two depths, the scene's nearest and the one that the ray had at time 0; the
+nearer result is used, which is right except for a pixel or two along edges. Newly uncovered areas continue the
 surface behind, and areas that enter the picture continue the surface at its border. Albedo is that of the nearest
 pixel.
 
@@ -40,7 +40,7 @@ class MovingSurfaces:
         self._views: dict[int, CameraView] = {}
 
     def view(self, still: CameraView, time_s: float) -> CameraView:
-        """The view at a given time of the bench, the same for `HOLD_S`. still: the view at time 0."""
+        """The view at a given time, the same for `HOLD_S`. still: the view at time 0."""
         step = math.floor(time_s / HOLD_S + 1e-6)
         with self._lock:
             if step not in self._views:

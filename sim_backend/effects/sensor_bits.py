@@ -59,8 +59,8 @@ class Crosstalk:
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
     with probability c / 4 (c: `crosstalk`), all independently. Pixels fired in this way trigger no others, an effect of
     order c^2. A pixel that fires by itself with probability p and has m neighbours that fired is 1 with probability
-    1 - (1 - p)(1 - c/4)^m. If all pixels have the same small p, that is on average p (1 + c). Light across the border
-    is lost. c is 0.1 to 0.2 % in 512 x 512 arrays of large pitch; the share beyond the 4 neighbours is not modelled.
+    1 - (1 - p)(1 - c/4)^m. If all pixels have the same small p, that is on average p (1 + c). Light that leaves the
+    array is lost. c is 0.1 to 0.2 % in 512 x 512 arrays of large pitch; the share beyond 4 neighbours is not modelled.
 
     Exact for any c. Each pixel has four possible transfers (up, down, left, right), numbered pixel by pixel; the gaps
     between those that occur are drawn. Cost per frame of 512 x 512: 9 us at 0.15 %, in proportion to c.

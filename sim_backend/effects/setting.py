@@ -17,9 +17,8 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: effects that simulated
-    devices reported when they were made, with the reason.
-    """
+    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: by name, effects that the
+    rig model has or that simulated devices reported when they were made, with the reason."""
 
     view: CameraView
     scene: SceneFile
@@ -62,8 +61,8 @@ class LaserEffect(Protocol):
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
 
-        `rate` holds what the effects before this one in the catalogue have added for this sheet, which may be changed.
-        It is float64, or float32 when frames are drawn; seven digits are more than photons can show.
+        `rate` holds what earlier effects of the catalogue have added for this sheet; an effect may change that light.
+        `rate` is float64, or float32 when frames are drawn; seven digits are more than photons can show.
         """
         ...
 
@@ -72,14 +71,14 @@ class BitEffect(Protocol):
     """A change that the sensor makes to the bits of its frames."""
 
     reads_before: bool
-    """Whether `before` is read. If so, the last frame of every gap is drawn, too, though nobody receives it."""
+    """Whether `before` is read. If so, the simulated SPAD also draws the last frame of every gap."""
 
     def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
         """Change whole frames first_frame, first_frame + 1, ... in place: `words` (frames, rows, words) uint64 in
-        packbits order (`sim_backend.frames.photon_kernels`). Pad bits stay 0.
+        packbits order (`sim_backend.effects.sensor_bits.bit_of`). Pad bits stay 0.
 
         seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect received them, zeros
-        if there is none. The result for a frame depends only on the seed, its number, its own bits and its
+        if that frame was not drawn. The result for a frame depends only on the seed, its number, its own bits and its
         predecessor's, not on how frames are grouped in blocks. Releases the GIL.
         """
         ...

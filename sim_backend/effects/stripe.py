@@ -6,11 +6,11 @@ of extinction sigma, the radiance L integrated along the row is
 
     integral of L dx = (rho/pi) (J/r) |N.e| / |d(n.X)/dx| exp(-sigma (r + |X|))          per pixel of row
 
-with n.X taken on the surface along the row. For a rectified rig, with the rays q_p of the projector and q = q_c of the
-camera, this is the camera-side cosine law (rho/pi) I0 du |N.q| / Z^2 exp(-sigma Z (|q_p| + |q_c|)), with
-I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the facet m.X = 1 through the point: |N.e| = |1 - m.S|/(|m| r) for a
-source at S. The profile along the row is a Gaussian integrated over each pixel, of the width that
-`sim_backend.light.line` gives.
+with n.X taken on the surface along the row. For a rectified rig, with the rays q_p = (u_p, v_p, 1) of the projector
+and q = q_c of the camera and the depth Z, this is the camera-side cosine law (rho/pi) I0 du |N.q| / Z^2
+exp(-sigma Z (|q_p| + |q_c|)), with I0 du = J sqrt(1 + u_p^2)/|q_p|^2. The surface is the facet m.X = 1 through the
+point: |N.e| = |1 - m.S|/(|m| r) for a source at S. The profile along the row is a Gaussian integrated over each pixel,
+of the width that `sim_backend.light.line` gives.
 
 A share f of what the medium scatters (`forward_share`; droplets: half) is diffraction, which turns light by 1 to 2
 degrees only. The stripe's extinction counts this light as lost; `ForwardBlur` brings it back as a wider copy. On a path
@@ -33,7 +33,7 @@ from sim_backend.light.sheet import Arrays, LightSheet, Traced
 from sim_backend.scenes.medium import FORWARD_ANGLE
 
 REACH_SIGMAS = 5.0
-"""Sds at which the Gaussian is cut; 6e-7 of the stripe is left out."""
+"""Standard deviations at which the Gaussian is cut; 6e-7 of the stripe is left out."""
 MIN_SLOPE = 0.02
 """Smallest slope of the sheet against the surface along a row, as a share of the sheet's own: keeps a stripe that runs
 along the row, which has no position in it, from being infinitely bright."""
@@ -75,10 +75,10 @@ def _between(values: Array, y: int, x: int, t: float) -> float:
 def row_light(
     view: Arrays, inverse: Array, offset_m: Array, extinction_per_m: float, y: int, centre: float
 ) -> tuple[float, float, float, float]:
-    """The undeflected light of the stripe at pixel `centre` of row y, integrated along the row.
+    """The undeflected light of the stripe at position `centre` (in pixels) of row y, integrated along the row.
 
-    Returns rho |N.e| / (r |d(n.X)/dx|) exp(-sigma way), for J/pi = 1; the length of the light's path in metres; the
-    distance from the mirror; and the inverse depth.
+    Returns rho |N.e| / (r |d(n.X)/dx|) exp(-sigma way), for J/pi = 1; the length `way` of the light's path in metres;
+    the distance r from the mirror; and the inverse depth.
     """
     u, v, u_x, v_x, facet, albedo, source = view
     k = min(y, len(inverse) - 1)

@@ -1,9 +1,10 @@
-"""The flux of every pixel: detected photons per exposure for one mirror command, from the effects that are run.
+"""The flux of every pixel: mean detections per exposure at one mirror command, from the effects that are run.
 
     lambda = exposure (steady + share power sheet),     p = 1 - exp(-lambda)
 
-share is the part of the exposure during which the gate let light out. `steady` is computed once, `sheet` once per
-command.
+with the flux lambda and the probability p that the pixel's bit is 1. `share` is the part of the exposure during which
+the gate let light out. `steady` are detections per second without the laser, computed once; `sheet` are the laser's
+detections per second and watt, computed once per command.
 
 Tracing the light costs more than drawing a frame. So the frames that the mirror spends in one cell of a grid
 (`CommandGrid`) all get their mean position; the mean position over a column's frames is then that of the moving mirror.
@@ -47,7 +48,7 @@ class FluxModel:
         return min((held for effect in self.laser.values() if (held := hold_s(effect)) > 0), default=0.0)
 
     def without(self, names: Collection[str]) -> "FluxModel":
-        """The model with fewer effects. The remaining effects are not created again."""
+        """The model without the effects of these names. The remaining effects are not created again."""
         fewer = copy(self)
         fewer.laser = {name: effect for name, effect in self.laser.items() if name not in names}
         fewer.steady = {name: rate for name, rate in self.steady.items() if name not in names}
@@ -96,8 +97,8 @@ class CommandGrid:
     def hold(self, commands: Array, steps: Array) -> Array:
         """For frames at commands (n,): the mean position of all frames in the same cell; NaN outside the grid.
 
-        steps: (n,) how far the mirror moves from one frame to the next. 0 means that the frame is alone, as when one
-        step leaves the cell. NaN means unknown: the frame is held at the cell's own position.
+        steps: (n,) how far the mirror moves from one frame to the next. A frame with step 0, or alone in its cell,
+        keeps its own position. NaN means unknown: the frame gets the cell's own position.
         """
         if len(self.positions) == 0:
             return np.full(commands.shape, np.nan)
@@ -123,7 +124,7 @@ def column_grid(commands: Array, limits: tuple[float, float]) -> CommandGrid:
 
 
 def fine_grid(width: int, limits: tuple[float, float]) -> CommandGrid:
-    """Grid for a bench that does not know the columns."""
+    """Grid over the limits for unknown columns, with `FINE_POSITIONS_PER_PX` positions per pixel of the width."""
     return _grid(np.linspace(*limits, FINE_POSITIONS_PER_PX * width + 1), limits)
 
 

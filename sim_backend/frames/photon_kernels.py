@@ -1,14 +1,14 @@
 """Compiled exact Bernoulli sampling of packed binary frames, 16 pixels at a time.
 
 A pixel's bit is 1 with probability p. It is set if a random number of 16 bits is below the pixel's level, about 2^16 p.
-The rest of p comes from a second draw: each pixel is chosen with chance c = 3 x 2^-16, about twelve per frame, and its
-bit is drawn again with chance s, where
+The rest of p comes from a second draw: each pixel is chosen with chance c = 3 x 2^-16 (about twelve in a frame of
+512 x 512), and its bit is drawn again with chance s, where
 
     p = (1 - c) level / 2^16 + c s,     0 <= s <= 1 for every level within [2^16 (p - c) / (1 - c), 2^16 p / (1 - c)]
 
 That interval is three levels wide. So levels may be computed in float32 while every p is exact to the last bit of a
 float64; 0 never fires and 1 always does. The highest 16-bit level stands for 2^16 itself: its pixels are 1 whatever the
-random number, so they are set afterwards. Random numbers depend only on seed, frame, row and place
+random number, so they are set afterwards. Random numbers depend only on seed, frame and pixel
 (`sim_backend.random_numbers`), not on windows, threads or blocks.
 
 Measured for 512 x 512 on one core: 12 us a frame, and 0.12 ms for new levels when half of the words are lit.
@@ -98,7 +98,7 @@ def set_levels(
 
 @numba.njit(inline="always")
 def _is_lit(rate_bits: NDArray[np.uint32], row: np.uint64, word: int, width: int) -> bool:
-    """Whether there is light in a word of pixels."""
+    """Whether there is laser light in a word of pixels."""
     light = np.uint32(0)
     for i in range(min(WORD_PX, width - word * WORD_PX)):
         light |= rate_bits[row, np.uint64(word * WORD_PX) + np.uint64(i)]
@@ -212,12 +212,12 @@ def _draw_anew(
 
 
 _DROP_STREAM = np.uint64(0xA0761D6478BD642F)
-"""Stream that keeps the draws of lost frames apart from those of photons."""
+"""Stream that keeps the draws of `dropped_frames` apart from those of photons."""
 
 
 @numba.njit(cache=True, nogil=True)
 def dropped_frames(seed: np.uint64, first_frame: int, frames: int, probability: float) -> NDArray[np.bool_]:
-    """Mask of the frames that get lost, bool (frames,), each with the given probability."""
+    """Mask of frames chosen at random, such as those that get lost, bool (frames,), each with this probability."""
     lost = np.zeros(frames, np.bool_)
     for f in range(frames):
         random = frame_key(seed ^ _DROP_STREAM, np.uint64(first_frame + f))

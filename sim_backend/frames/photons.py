@@ -1,9 +1,10 @@
 """Binary frames from flux: exact Bernoulli bits, packed as in SPB1, the same for any block size and number of threads.
 
 Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
-traced, its flux summed and p turned into levels; then each frame is drawn from the levels. Rows are split over threads,
-each of which goes by itself through all spans of a block (or of one moment, if things move); steps work row by row, so
-the split does not matter. The sensor's effects on bits act on whole frames, and windows are cut out afterwards.
+traced, its flux summed and turned into levels (thresholds for random numbers, see `photon_kernels`), from which each
+frame is drawn. Rows are split over threads, each of which goes by itself through all spans of a block (or of one
+moment, if things move); steps work row by row, so the split does not matter. The sensor's effects on bits act on whole
+frames, and windows are cut out afterwards.
 Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
 on two (`python -m tests.benchmarks.simulator`).
 """
@@ -32,7 +33,7 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Span:
-    """Frames first..last-1 of a block. moment_s: time of the bench, for moving things. power_w: 0 in the dark. sheets:
+    """Frames first..last-1 of a block. moment_s: time, for moving things. power_w: 0 in the dark. sheets:
     of all lines, still to be traced; None in the dark, or if those of the last lit span still apply. fresh: whether the
     levels change.
     """
@@ -46,7 +47,7 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of a configured SPAD. Call it from one thread; this one is among the up to `threads` used."""
+    """Draws the frames of a configured SPAD. Call it from one thread, which is one of the up to `threads` used."""
 
     def __init__(
         self,
@@ -90,8 +91,8 @@ class PhotonSource:
         """Fill `bits` (n, rows, row bytes) with windows of frames first_frame, first_frame + 1, ...
 
         held: mirror positions (n,), or (n, 2) for the exposure of the first and the last row; NaN if no light meets the
-        scene. power_w: (n,) averaged over each exposure. x0: (n,) first pixel of each window, a multiple of 64.
-        time_s: (n,) start of each exposure in the bench's time, for scenes that move.
+        scene. power_w: (n,) of the laser, mean over each exposure. x0: (n,) first pixel of each window, multiple of 64.
+        time_s: (n,) start of each exposure, for scenes that move.
         """
         words = bits.view(np.uint64)
         first_word = x0 // np.int32(WORD_PX)
@@ -167,7 +168,7 @@ class PhotonSource:
             self._model.setting.view.trace(sheet, a, b)
 
     def _set_rate(self, sheets: list[LightSheet], a: int, b: int) -> None:
-        """Set rows a..b-1 of `_rate`: detections per second and watt of all sheets."""
+        """Set rows a..b-1 of `_rate`: detections per second and watt of all sheets. Bowed sheets are traced before."""
         model, rate, of_line = self._model, self._rate, self._of_line
         rate[a:b] = 0
         for sheet in sheets:

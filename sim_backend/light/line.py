@@ -6,6 +6,8 @@ flux of a frame, in which each line's stripe and haze end at its own object, is
 
     lambda = exposure (steady + power sum over lines of share sheet_l)
 
+with the share of the laser's power that each line has; the rest is as in `sim_backend.frames.flux`.
+
 The width combines the line's own width, the spread of the sheet, and defocus:
 
     sigma^2 = sigma_px^2 + (f spread/4 r/z)^2 + (c/4)^2,      c = f^2 |1/z - 1/z0| / (N pitch (1 - f/z0))
@@ -58,10 +60,10 @@ class LineFan:
     def sheets(
         self, sheets_of: SheetsOf, held: Array, rows: int, moment_s: Sequence[float], limits: Limits = EVERYWHERE
     ) -> list[list[LightSheet]]:
-        """Sheets of the lines, not traced yet, at mirror positions (n,), or (n, 2) for the exposure of the first and
-        last row.
+        """For each of n mirror positions, the sheets of the lines, not traced yet. A line that is beyond the limits on
+        any row gives no sheet, and a position that is NaN gives none at all.
 
-        moment_s: (n,) times of the bench. A line beyond the rig model's range gives no sheet.
+        held: (n,), or (n, 2) for the exposure of the first and last row. moment_s: (n,) times, for what moves.
         """
         ends = held if held.ndim == 2 else held[:, None]
         down = np.linspace(0, 1, rows) if ends.shape[1] > 1 else np.zeros(1)

@@ -71,7 +71,7 @@ class Line(Section):
     fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
     """Angle over which the power is spread evenly; it is assumed to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)
-    """Gaussian width of the stripe in the picture, pixels: line width and blur of the lens together."""
+    """Standard deviation of the stripe's Gaussian profile, in pixels: line width and blur of the lens together."""
     spread: Annotated[Radians, Field(ge=0, lt=0.1)] = 0.0
     """Full angle (1/e^2) by which the sheet gets thicker on its way, on top of `sigma_px`."""
     thickness: Annotated[Metres, Field(gt=0, le=0.1)] = 2e-3

@@ -1,14 +1,15 @@
 """The light sheet of one mirror command in a scene: where it is seen on each row, and where it ends.
 
 A world is 2.5-D: one depth per pixel, with shadows along rows. Light that has gone behind a surface stays behind it. A
-row sees its sheet as a plane. All rows share one plane unless the sheet bows or rows are exposed one after the other.
-Then each row has its own: that of the mirror at the row's time, and the tangent of the bowed sheet where the row sees
-it.
+row sees its sheet as a plane n.X = d. All rows share one plane unless the sheet bows or rows are exposed one after the
+other. Then each row has a plane of its own, for the mirror's position at the row's time. If the sheet bows, the plane
+is the tangent at the place where the row sees the sheet.
 
-A compiled walk follows the light along each row and finds whether it ends as a stripe. On a row the sheet's inverse
-depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk starts at the edge of the
-picture where w is larger and ends where w falls below the surface's inverse depth. Spans of 32 pixels in which even the
-least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for 512 x 512 pixels, half of them lit.
+A compiled walk follows the light along each row and finds whether it ends as a stripe. Along a row with rays (u, v, 1)
+the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk
+starts at the edge of the picture where w is larger and ends where w falls below the surface's inverse depth. Spans of
+32 pixels in which even the least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for
+512 x 512 pixels, half of them lit.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ class LightSheet:
     x_end_px: (rows,) float64, end of the lit part, NaN = nothing lit.
     start_px, step: (rows,) int64, first pixel on the light's way and its direction along the row (+1, -1, 0 = not
     seen).
-    time_s: time of the bench, for what moves.
+    time_s: time at which the sheet shines, for what moves.
     bowed: the bowed sheets that the planes are tangent to; None if the sheet itself is flat.
     """
 
@@ -58,10 +59,8 @@ class LightSheet:
         return self.inverse, self.offset_m, self.x_stripe_px, self.x_end_px, self.start_px, self.step
 
     def touch(self, u: Array, v: Array, first_row: int, last_row: int) -> None:
-        """Make the planes of rows first_row..last_row-1 touch the bowed sheet where the rays u, v (rows,) meet it.
-
-        A row whose ray does not meet it keeps its plane.
-        """
+        """Make the planes of rows first_row..last_row-1 touch the bowed sheet where the rays (u, v), one for each of
+        these rows, meet it. A row whose ray does not meet it keeps its plane."""
         assert self.bowed is not None, "a flat sheet is its own plane"
         rows = slice(first_row, last_row)
         bowed = replace(
@@ -106,8 +105,8 @@ SPAN_PX = 32
 
 @numba.njit(cache=True, nogil=True)
 def trace_rows(u: Array, v: Array, surface: Array, bounds: Array, sheet: Traced, first_row: int, last_row: int) -> None:
-    """Trace rows first_row..last_row-1 of a sheet, and write where its stripe and its end are and which way its light
-    goes.
+    """Trace rows first_row..last_row-1 of a sheet, and write into it where its stripe and its end are and which way its
+    light goes.
 
     surface: inverse depth of the scene (rows, width), 0 = open sky. bounds: see `span_bounds`. step is +1 where the
     light travels towards larger x (scanner on the left).
@@ -163,8 +162,7 @@ def trace_rows(u: Array, v: Array, surface: Array, bounds: Array, sheet: Traced,
 @numba.njit(cache=True)
 def span_bounds(u: Array, v: Array, surface: Array) -> Array:
     """Smallest and largest u, smallest and largest v, and largest inverse depth of every span, (rows, spans, 5). The
-    inverse depth is infinite where a ray is NaN.
-    """
+    inverse depth is infinite for a span with a ray that is NaN."""
     rows, width = u.shape
     bounds = np.zeros((rows, -(-width // SPAN_PX), 5))
     bounds[:, :, 0], bounds[:, :, 1], bounds[:, :, 2], bounds[:, :, 3] = np.inf, -np.inf, np.inf, -np.inf

@@ -11,7 +11,7 @@ from sim_backend.light.sheet import DEPTH_JUMP, Array, Arrays, LightSheet, empty
 from sim_backend.scenes.surfaces import Surfaces
 
 Moves = Callable[["CameraView", float], "CameraView"]
-"""A motion of the surfaces: from the view at time 0 to that at a time of the bench. Any thread may call it."""
+"""A motion of the surfaces: from the view at time 0 to that at a given time in s. Any thread may call it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,8 +19,8 @@ class CameraView:
     """Rays and surfaces on the camera's pixel grid. All maps are float64 (rows, width).
 
     u, v: ray tangents, NaN where the lens model has no inverse. u_x, v_x: their slopes per pixel along the row.
-    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), the plane m.X = 1 through each surface
-    point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None if nothing moves.
+    surface: inverse depth in 1/m (0: nothing there). facet: (rows, width, 3), m of the tangent plane m.X = 1 at each
+    surface point. albedo: 0..1. source_m: (3,) where the light leaves the mirror. motion: None if nothing moves.
     """
 
     u: Array
@@ -39,7 +39,7 @@ class CameraView:
         object.__setattr__(self, "bounds", span_bounds(self.u, self.v, self.surface))
 
     def at(self, time_s: float) -> "CameraView":
-        """The view at a given time of the bench."""
+        """The view at a given time."""
         return self if self.motion is None else self.motion(self, time_s)
 
     @property
@@ -69,7 +69,7 @@ class CameraView:
         return 1.0 / float(np.median(lit)) if len(lit) else 0.0
 
     def sheet(self, plane: Array, time_s: float = 0.0) -> LightSheet:
-        """The flat sheet of the plane (4,) = nx, ny, nz, d at a time of the bench, traced on every row."""
+        """The flat sheet of the plane (4,) = nx, ny, nz, d at a given time, traced on every row."""
         sheet = empty_sheet(plane, self.rows, time_s)
         self.trace(sheet, 0, self.rows)
         return sheet

@@ -27,7 +27,7 @@ from drivers.units import Metres, MetresPerHour, MetresPerSecond, PerMetre
 KOSCHMIEDER = 3.912
 """-ln(0.02): extinction times visibility at 2 % contrast (Koschmieder's law)."""
 DROPLET_BACKSCATTER = 0.05
-"""1/sr: water droplets, lidar ratio 18 to 20 sr."""
+"""Phase function of water droplets at 180 degrees, in 1/sr: one over a lidar ratio of 18 to 20 sr."""
 DROPLET_G = 0.85
 """Mean cosine of scattering of fog droplets in visible light."""
 SMOKE_BACKSCATTER, SMOKE_SCATTERING_SHARE = 0.027, 0.96
@@ -168,7 +168,7 @@ class Medium(Section):
 
     @property
     def phase_terms(self) -> tuple[tuple[float, float], ...] | None:
-        """(weight, g) of the Henyey-Greenstein terms; None if `backscatter` holds at all angles near 180 degrees."""
+        """(weight, g) of the Henyey-Greenstein terms; None if only `backscatter` is given."""
         if self.phase is None:
             return None
         if isinstance(self.phase, str):
@@ -177,23 +177,23 @@ class Medium(Section):
 
     @property
     def back_per_sr(self) -> float:
-        """Phase function at 180 degrees."""
+        """Phase function at 180 degrees, in 1/sr."""
         if self.phase_terms is None:
             return self.backscatter
         return float(sum(weight * henyey_greenstein(-1.0, g) for weight, g in self.phase_terms))
 
     @property
     def mean_cosine(self) -> float:
-        """Mean cosine of the scattering angle: 0 isotropic, near 1 forward-peaked."""
+        """Mean cosine of the scattering angle: 0 isotropic, near 1 forward-peaked. If only `backscatter` is given, that
+        of droplets or smoke."""
         if self.phase_terms is not None:
             return sum(weight * g for weight, g in self.phase_terms)
         return DROPLET_G if self.smoke is None else SMOKE_G
 
     @property
     def lobes(self) -> tuple[tuple[float, float], ...]:
-        """(weight, g) of Henyey-Greenstein terms for what is scattered by more than the forward share, which is taken
-        from the most forward one. Where only `backscatter` is given, two with this value and the mean cosine.
-        """
+        """(weight, g) of Henyey-Greenstein terms for scattering without the forward share, which is taken from the most
+        forward term. If only `backscatter` is given, two terms that have about this value and the mean cosine."""
         rest, terms = 1 - self.forward_share, self.phase_terms
         if terms is None:
             g = (self.mean_cosine - self.forward_share) / rest
@@ -219,7 +219,7 @@ LAMBERT_SPHERE_BACK = 2 / (3 * math.pi)
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Particles per m^3 and mm of diameter: n0 exp(-slope D)."""
+    """Particles per m^3 and mm of the diameter D in mm: n0 exp(-slope D)."""
 
     n0_per_m3_mm: float
     slope_per_mm: float

@@ -31,7 +31,7 @@ class AmbientLight(Section):
 
 
 class SceneMotion(Section):
-    """Uniform motion of all surfaces together, from the bench's time 0 on."""
+    """Uniform motion of all surfaces together, from time 0 on, when the simulated world is made."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Velocity along x (right), y (down), z (away from the camera)."""
@@ -71,7 +71,7 @@ class SceneFile(Section):
     ambient: AmbientLight | None = Field(default=None, examples=["{illuminance: 100 lux}"])
     motion: SceneMotion | None = Field(default=None, examples=["{velocity: [0 m/s, 0 m/s, -2 m/s]}"])
     seed: int = Field(default=1, ge=0, lt=2**63, examples=["1"])
-    """Seed of the drops and flakes, their places, and the speckle."""
+    """Seed of the drops and flakes (sizes and places) and of the speckle."""
 
     @model_validator(mode="after")
     def _boards_on_board_scenes(self) -> Self:
@@ -134,7 +134,7 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
 
 
 def with_fog(scene: SceneFile, visibility: str) -> SceneFile:
-    """The scene with air of another visibility (text with a unit), or without a medium if that is CLEAR.
+    """The scene with air of another visibility (text with a unit), or without a medium if `visibility` is CLEAR.
 
     Only the density changes: smoke stays smoke, with its own phase function and shares. Clear air becomes fog.
     """

@@ -51,7 +51,7 @@ def _walls(u: Array, v: Array) -> list[Body]:
 
 
 def _car(u: Array, v: Array) -> list[Body]:
-    """A car parked askew. Its own frame: x across, z from front (negative) to back, origin on the camera's height."""
+    """A car parked askew. Its own frame: x across, z from front (negative) to back, origin at the camera's height."""
     side, front, back = 0.75, -1.45, 1.45
     hull = [
         (-1, 0, 0, side), (1, 0, 0, side), (0, 1, 0, 1.1), (0, 0, 1, back),
@@ -75,7 +75,7 @@ def _wheel(x: float, z: float) -> list[Face]:
 
 
 def _parked(faces: Sequence[Face]) -> list[Face]:
-    """Faces turned and moved from the car's frame to where it is parked."""
+    """Faces turned and moved from the car's frame to where the car is parked."""
     angle, x, z = 0.6, 1.6, 5.7
     cos, sin = np.cos(angle), np.sin(angle)
     turned = [(nx * cos - nz * sin, ny, nx * sin + nz * cos, d) for nx, ny, nz, d in faces]

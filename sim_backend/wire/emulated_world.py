@@ -1,7 +1,7 @@
 """The simulated world behind emulated devices: real drivers on emulated wires, with one scene in front of them.
 
-    rig -> real driver -> pyusb, pyserial -> emulated bus, pseudo terminal -> device model
-                                                                                |
+    rig -> real driver -> pyusb, pyserial, socket -> emulated bus, pseudo terminal, port -> device model
+                                                                                              |
     light = laser's emission AND sync source's gate; mirror = scanner's output; frames = SPAD's exposures
 
 Everything runs in the host's time. Frames are drawn when the host takes them, from what the rig did while they were
@@ -65,7 +65,7 @@ KEPT_FRAMES = 1_000_000_000
 LASERS = {"cobolt": CoboltModel, "ibeam": IbeamModel, "obis": ObisModel}
 """Firmware models that can answer at emulated:laser. Each needs `on_emission`, `power_w` and `receive`."""
 LOOK_S = 10e-6
-"""Distance of the times at which the scan marker is looked at. At the highest point rates it is low for longer."""
+"""Step of the times at which the scan marker is looked at. Even at the highest point rates it is low for longer."""
 
 
 class EmulatedWorldConfig(WorldConfig):
@@ -75,9 +75,9 @@ class EmulatedWorldConfig(WorldConfig):
 
     kind: str = "emulated"
     laser: Literal["cobolt", "ibeam", "obis", "ttl"] = "cobolt"
-    """The laser that answers at emulated:laser; `ttl` only shines."""
+    """The laser that answers at emulated:laser. `ttl` does not answer; it shines whenever the gate is high."""
     ttl_power: Annotated[Watts, Field(gt=0)] = 0.05
-    """Power at which a laser of kind `ttl` was set by hand; `laser.power` must be the same."""
+    """Power to which a laser of kind `ttl` was set by hand; `laser.power` must be the same."""
     scanner: Literal["helios", "etherdream", "nidaq"] = "helios"
     """The scanner that answers at emulated:scanner."""
     sync: Literal["prawndo", "pulsestreamer", "teensy"] = "prawndo"
@@ -89,10 +89,11 @@ class EmulatedWorldConfig(WorldConfig):
 
 
 class EmulatedWorld(SimulatedWorld):
-    """One scene and the devices of the rig in front of it, which are plugged in when it is created."""
+    """One scene and the emulated devices of a rig in front of it. They are plugged in when the world is created."""
 
     def __init__(self, config: EmulatedWorldConfig, surroundings: Surroundings, bus: Any = None) -> None:
-        """Raises DeviceError if the geometry, the scene or the focus cannot be used, or the geometry has a row delay.
+        """Raises DeviceError as `SimulatedWorld` does, for a geometry with a row delay, and for `nidaq` if the packages
+        that it needs are not installed.
 
         bus: an object with a method `plug` that attaches a USB device; the caller closes it. By default an
         `EmulatedUsb`, within this process.
@@ -170,7 +171,7 @@ class EmulatedWorld(SimulatedWorld):
         self._frames.close()
 
     def photon_source(self, times: FrameTimes) -> PhotonSource:
-        """A source of frames that follow one another at these times."""
+        """A source of frames with this timing."""
         return self.photons(times, self._seed, min(MAX_THREADS, os.cpu_count() or 1))
 
     def _draw_once(self) -> None:
@@ -182,8 +183,8 @@ class EmulatedWorld(SimulatedWorld):
             source.expose(0, held, power_w, x0, bits, np.zeros(1))
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> tuple[BenchState, Array]:
-        """State of the bench during frames that start at start_s (n,), ascending, one period apart, and the laser's
-        power in W, (n,), in the middle of each exposure.
+        """State of the rig during frames that start at start_s (n,), ascending, one period apart, and the laser power
+        in W (n,) that an open gate lets out in the middle of each exposure.
 
         Times are the host's. The state's own power_w is that of the first frame.
         """
@@ -217,7 +218,7 @@ class EmulatedWorld(SimulatedWorld):
             self._emission.append((now_s, self.laser.power_w if emits else 0.0))
 
     def _scan_marker(self, from_s: float, until_s: float) -> float | None:
-        """First time in [from_s, until_s) when the scan marker, which triggers the sync source, is high, or None."""
+        """First time in [from_s, until_s) when the scan marker is high, or None. It triggers the sync source."""
         with self.scanner_plug.lock:
             self.scanner.advance(until_s)
             if self.scanner.history.level(BLUE, np.array([from_s]))[0]:
@@ -239,7 +240,7 @@ class EmulatedWorld(SimulatedWorld):
 
 
 class WorldFrames:
-    """The `FrameSource` of the emulated SPAD, which takes its frames from the simulated world."""
+    """Frames of the simulated world for the emulated SPAD: a `FrameSource` of SPB1 boards, `whole` for the SPAD512S."""
 
     def __init__(self, world: EmulatedWorld) -> None:
         self._world = world
@@ -266,8 +267,8 @@ class WorldFrames:
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
-        """Whole frames of a SPAD without records, exposed during their entire period; upright, (n, height, row
-        bytes)."""
+        """n full frames as the camera sees them, uint8 (n, height, row bytes), exposed for their whole period. start_s:
+        start of the first, host's time. Their records are dropped, since the SPAD512S sends pixels only."""
         rows, width = self._world.size
         bits = np.zeros((n, rows, packed_row_bytes(width)), np.uint8)
         self.expose(Span(first_frame, n, start_s, period_s, period_s, None), np.zeros(n, FRAME_RECORD), bits)

@@ -2,5 +2,5 @@
 
 Order of work: `labels` gives every candidate position of a row and column a cost in bytes; `paths` and `winner` pick
 the cheapest positions along rows and columns; `vote` corrects weak answers and `place` refines answers to sub-pixel
-positions; `confidence` judges answers by their neighbours; `lesson` and `halo` learn from them for the next map.
+positions; `confidence` judges answers by their neighbours; `lesson` and `halo` learn from answers for the next map.
 """

@@ -14,11 +14,11 @@ Three things can be wrong with an answer, and each has its factor:
   noise of this mean; contrast' = max(contrast + 3, 1). The whole haze, because an answer can lie a little before the
   end of haze, and half of the haze would then be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at
   most.
-- odds: ratio of answers around that agree to those that do not. Odds count the more, the more haze there is, by the
-  factor g = k / (k + SOME_HAZE) with k photons of haze per pixel in all exposures. In clear air only a stripe gives a
-  margin, and small things, whose surroundings do not agree, are as certain as others.
-- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of the
-  neighbours in the contrast, bright: photons that they would have at the model's largest amplitude. If even a dark
+- odds: ratio of pairs of answers around that agree to those that do not (`agreement_row`). Odds count the more, the
+  more haze ends at the stripe, by the factor g = k / (k + SOME_HAZE) with k photons of it per pixel in all exposures.
+  In clear air only stripes give a margin; small things, whose surroundings do not agree, are as certain as others.
+- missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of the 3 x 3
+  neighbours above the whole haze, in all exposures; bright: the same at the model's largest amplitude. If even a dark
   stripe would be visible, missing light means that there is no stripe. The contrast cannot show this.
 - unseen: max(AT_END - CLEARLY max(contrast, 0), 0), with e = 1 up to 1 px from the far end of the depth range and 0
   from 3 px on. Haze that continues beyond the range seems to end there, so evenly that answers agree; a stripe so far
@@ -314,7 +314,7 @@ def _number(at, width, c):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _above_haze(at, width, c):  # type: ignore[no-untyped-def]
-    """Light of these answers, photons per exposure, less the whole haze before them."""
+    """Sum of the light of the answers of `_number`, photons per exposure, above the whole haze before them."""
     return load_float32(at, _LIGHT_SUM * width + c) - _ending(at, width, c) * _HALF_PX * _number(at, width, c)
 
 

@@ -1,17 +1,17 @@
 """Learns haze and halo from the stripes of a sweep: the light of each stripe first, then one linear fit.
 
-The light of stripes (`likeliest_light`). A halo is measured by the light beside a stripe, relative to the stripe's own
-light. The light from `rig.estimate.joint.place.light` is the sum of the pixels' fluxes, which is limited when pixels
-saturate; bright stripes would be taken for dimmer ones with a stronger halo. Here the counts n of K frames of all
-pixels around a stripe and around its 5 x 5 neighbours on the same surface are explained by one amplitude a,
+The light of stripes (`likeliest_light`). A halo, a stripe's light that fog scatters to both sides, is measured relative
+to the stripe's own light. The light from `rig.estimate.joint.place.light` is the sum of the pixels' fluxes, which is
+limited when pixels saturate; bright stripes would be taken for dimmer ones with a stronger halo. Here the counts n of K
+frames of all pixels around a stripe and around its 5 x 5 neighbours on its surface are explained by one amplitude a,
 
     flux = base + a scale (psi + glow),     log-likelihood = sum n log(1 - exp(-flux)) - (K - n) flux
 
-with haze and ambient light as base, psi the share of the line in the pixel, and glow that of the halo in a pixel at the
-stripe. The log-likelihood is concave in a and its slope convex, so Newton's method converges from an amplitude that is
-too small. Saturated pixels give no information, those beside them do. If the amplitude is hardly more than its noise,
-or neighbours do not agree on it, the light of a stripe is unknown and the stripe is not used. Nor is a stripe with 2
-photons per exposure or more in one pixel.
+with haze and ambient light as base, scale the stripe's light at a = 1, psi the share of the line in the pixel, and glow
+that of the halo in a pixel at the stripe. The log-likelihood is concave in a and its slope convex, so Newton's method
+converges from an amplitude that is too small. Saturated pixels give no information, those beside them do. If a is
+hardly more than its noise, or neighbours do not agree on it, the light of a stripe is unknown and the stripe is not
+used. Nor is a stripe with 2 photons per exposure or more in one pixel.
 
 The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at the distance d along the row, show
 
@@ -21,7 +21,7 @@ The fit (`add_equations`, `solve`). The counts beside a stripe of s photons, at 
 with w the path inverse depth, share(w) the ratio of the level behind the stripe to the haze, and G and rho as in
 `rig.estimate.row.inputs`. Behind stripes, haze(w) is taken from the present model. So the flux is linear in haze
 (BINS), share (HALO_NODES), halo (HALO_NODES, reaches) and offset. One weighted least squares fit (float64) separates
-them, since the halo follows the brightness of each stripe and the haze does not; means over the pixels before and
+them, because the halo follows the brightness of each stripe and the haze does not; means over the pixels before and
 behind stripes could not separate them. Only the offset may be negative; it is 0 if there are dark frames. Later maps
 are tested for whether a halo has appeared or vanished.
 """
@@ -75,8 +75,8 @@ def add_equations(
     """Add the normal equations of lines first_line..last_line-1, weighted by the counts that the present state expects.
 
     Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; offset of
-    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons. Only
-    the lower triangle of the matrix is filled.
+    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons;
+    hot_flux: pixels with more ambient light are left out. Only the lower triangle of the matrix is filled.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -130,7 +130,7 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x, by coordinate descent. Only x[free] may be negative."""
+    """The x that minimises x' matrix x - 2 right' x, by coordinate descent. Only x[free] may be negative; -1: none."""
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
@@ -173,9 +173,9 @@ def likeliest_light(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, shares: Float32, x_px: Float32, places: Places,
     rows: Int32, columns: Int32, first_line: int, last_line: int, light: Float32, known: Bools,
 ) -> None:  # fmt: skip
-    """Fill `light` (photons per exposure) and `known`, items first_line..last_line-1, for stripes at (rows, columns).
+    """Fill items first_line..last_line-1 of `light`, photons per exposure, and `known`, whether that is reliable.
 
-    counts: (columns, rows, window); shares: of `profile_table`; x_px: (rows, columns), of all stripes.
+    Stripe i is at rows[i], columns[i]. counts: of a `CountVolume`; shares: of `profile_table`; x_px: of all stripes.
     """
     for i in range(first_line, last_line):
         y, c = rows[i], columns[i]
@@ -196,8 +196,8 @@ def likeliest_light(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ask(counts, n_frames, sweep, state, shares, x_px, places, y, c, a):  # type: ignore[no-untyped-def]
-    """First derivative of the log-likelihood with respect to the amplitude, minus its second derivative, misfit of the
-    stripes, and number of stripes.
+    """Ask the stripe at (y, c) and those around on its surface about amplitude a. Returns the first derivative of the
+    log-likelihood by a, the negative of the second derivative, the misfit of the stripes, and their number.
 
     The misfit is a sum over the stripes: the square of each one's contribution to the first derivative, divided by the
     variance of that contribution. Its expected value is about the number of stripes.
@@ -270,7 +270,7 @@ def bright_lines(
     volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
     number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Lines whose stripe has a known light, out of about `number` with a clear stripe, evenly spread over a map.
+    """Lines whose stripe has a known light, out of up to `number` with a clear stripe, evenly spread over a map.
 
     tables: those that the map was made with; places: of its stripes.
     """
@@ -290,7 +290,7 @@ def learn_first_halo(
 ) -> RowModel:  # fmt: skip
     """The first map's model with the halo of `learn_halo`. Call it again with the map that is made with the new model.
 
-    With several lines at once the model stays as it is, since the other lines' haze would be taken for a halo.
+    With several laser lines at once the model stays as it is, since other lines' haze would be taken for a halo.
     """
     if geometry.others is not None:
         return model
@@ -312,8 +312,8 @@ def halfway(before: RowModel, after: RowModel) -> RowModel:
 
 def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWorkers) -> RowModel:
     """The model of a later lesson. A halo is added when the map begins to show one, and removed when it shows none.
-    Nothing changes with fewer than FEWEST_LIGHTS stripes of known light, with several laser lines at once, or in a
-    model without a halo whose extinction is unknown.
+    Nothing changes with fewer than FEWEST_LIGHTS stripes of known light, with several laser lines at once, or if the
+    model has no halo and its extinction is unknown.
 
     A halo that stays is not changed. If it were learned anew from so few lines in lesson after lesson, halo, haze and
     the level behind stripes would drift against each other (in steady fog errors grow by 10 to 25 % in eight maps).
@@ -330,10 +330,10 @@ def learn_next_halo(setting: LearningSetting, seen: BrightLines, workers: RowWor
 def learn_halo(
     seen: BrightLines, geometry: SweepGeometry, model: RowModel, ambient: Float32, workers: RowWorkers, *, dark: bool
 ) -> RowModel:
-    """The model with the halo that these stripes show, and the haze under it; without a halo if they show none.
+    """The model with the halo that these stripes show, and the medium under it; without a halo if they show none.
 
-    The scale of stripes is kept, since their light is based on it. ambient: of each pixel, (rows, width), the start
-    value of the fit. dark: whether there are dark frames.
+    With a halo, haze, extinction and ambient light change too. The scale of stripes is kept, since their light is based
+    on it. ambient: of each pixel, (rows, width), start value of the fit. dark: whether dark frames have measured it.
     """
     matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
     free = -1 if dark else _SIZE - 1

@@ -2,14 +2,14 @@
 
 Each label (candidate position) of a row and column (`rig.estimate.joint.labels.grid`) gets a cost from the counts
 (`rig.estimate.joint.labels.costs`, a fast form of `rig.estimate.row.likelihood`). The cost includes the halo, if there
-is one (`rig.estimate.joint.labels.halo_rows`), and the previous map, if requested (`rig.estimate.joint.temporal`).
-Under a halo the cost is averaged with a second one that needs no model of the medium
-(`rig.estimate.joint.labels.contrast`). Costs are tied to those of the neighbours along four paths
-(`rig.estimate.joint.paths`); weak answers are decided by a vote of all neighbours (`rig.estimate.joint.vote`). The
-answer of each row and column is then refined to a position between labels, with the help of neighbours on its surface
-(`rig.estimate.joint.place.place`), and gets a confidence (`rig.estimate.joint.confidence`). Each row is searched for a
-second line (`rig.estimate.joint.second_returns`). The model of light and medium is learned row by row first, as by
-`likelihood`, then from the map's own stripes.
+is one (light of the stripe that fog scatters to both sides, `rig.estimate.joint.labels.halo_rows`), and the previous
+map, if requested (`rig.estimate.joint.temporal`). Under a halo the cost is averaged with a second one that needs no
+model of the medium (`rig.estimate.joint.labels.contrast`). Costs are tied to those of the neighbours along four paths
+(`rig.estimate.joint.paths`). If columns are close to each other, all neighbours vote on weak answers
+(`rig.estimate.joint.vote`). The answer of each row and column is then refined to a position between labels, with the
+help of neighbours on its surface (`rig.estimate.joint.place.place`), and gets a confidence
+(`rig.estimate.joint.confidence`). Each row is searched for a second stripe (`rig.estimate.joint.second_returns`). The
+model of light and medium is learned row by row first, as by `likelihood`, then from the map's own stripes.
 """
 
 from dataclasses import dataclass, replace
@@ -34,20 +34,20 @@ from rig.simd import Float32
 from rig.threads import RowWorkers
 
 LESSONS = 2
-"""Number of times that the first map's stripes are estimated and the model is learned again from them."""
+"""Number of lessons: times that the first map's stripes are estimated and the model is learned again from them."""
 HALO_LESSONS = 3
-"""Number of these lessons under a halo."""
+"""Number of lessons in which stripes are checked by contrast, after a new start: under a halo or with lost stripes."""
 KEPT_WORSE = 0.0015
-"""Share of the log likelihood by which a kept medium may explain a first sweep worse than the one that was learned from
-it row by row. It is at most 0.0004 in the same fog, 0.001 at 0.8 of the visibility, 0.002 and more in other scenes."""
+"""Share of the log likelihood by which a kept medium may explain a first sweep worse than the medium learned from that
+sweep. Measured: up to 0.0004 in the same fog, 0.001 at 0.8 of the visibility, 0.002 and more in other scenes."""
 AGREE_PX = np.float32(1.0)
-"""Under a halo, a first map's stripe is learned from only if contrast alone puts it at most this far away, in px."""
+"""In the lessons that check stripes by contrast, a stripe teaches only if contrast alone puts it this near, in px."""
 TRUSTED = np.float32(0.5)
-"""An answer teaches if its trust exceeds this: under a halo, amplitudes are learned only from such stripes."""
+"""An answer teaches if its trust (`fill_trust`) exceeds this; in lessons with contrast only these teach amplitudes."""
 COUNTING_THREADS = 4
 """Most threads that count: more only get into each other's way, since counting waits for memory."""
 LOST = 0.2
-"""If fewer answers than this share teach the last lesson in fog, light scattered many times may hide the stripes."""
+"""If a smaller share of answers teaches the last lesson in fog, light scattered many times may hide the stripes."""
 
 
 class Joint:
@@ -55,7 +55,7 @@ class Joint:
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.
-    kept: state of an earlier run, used for the first map if it explains its counts.
+    kept: state of an earlier run, used for the first map if it explains that map's counts.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Joint:
         self._lessons = OnlineLearner(tables_of, None, learns=learns, learn_more=learn_next_halo)
         self._kept = kept
         self.kept_serves: bool | None = None
-        """Whether the first map was estimated with the kept state; None before, and if there is none."""
+        """Whether the first map was estimated with the kept state; None before that map, or if no state was kept."""
         self._prior = TemporalPrior(temporal_prior)
         self._solver = MapSolver(self._workers, self._prior)
         self.used: RowModel | None = None
@@ -81,7 +81,7 @@ class Joint:
 
     @property
     def model(self) -> RowModel | None:
-        """The state with which the next map will be estimated."""
+        """The state with which the next map will be estimated; None until a map was good enough to learn from."""
         model, before = self._lessons.model, self._prior.before
         return model if model is None or before is None else replace(model, before=before)
 
@@ -107,12 +107,12 @@ class Joint:
         return stripes
 
     def most_at_once(self, geometry: SweepGeometry) -> int:
-        """Number of maps at the same time for which there is memory; 1 with a temporal prior."""
+        """See `rig.estimate.registry.ManyMaps`; 1 with a temporal prior, 0 if there is only memory for one map."""
         # The estimator itself keeps memory for one map more.
         return 1 if self._prior.on else MOST_BYTES // bytes_of(grid_of(geometry)) - 1
 
     def solver(self) -> MapSolver:
-        """Memory and a thread for one of several maps at the same time."""
+        """A solver for one of several maps at the same time, which works on the caller's thread."""
         return MapSolver(RowWorkers(1))
 
     def may_begin(self, frames: int) -> bool:
@@ -120,7 +120,7 @@ class Joint:
         return self._lessons.certain(frames)
 
     def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver) -> "MapWork":
-        """Begin the map of a sweep, see `ManyMaps`."""
+        """Begin the map of a sweep, see `rig.estimate.registry.ManyMaps`."""
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
@@ -156,13 +156,13 @@ class Joint:
             (model, teaching), lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
             lost = foggy and lessons == LESSONS and teaching < LOST
             if witness_px is None and (model.halo.any() or lost):
-                # Light scattered many times has misled these lessons, so that they found a halo, or too few stripes to
+                # Light scattered many times may have misled these lessons: they found a halo, or too few stripes to
                 # find one. Begin again, and check stripes by contrast.
                 misled = model
                 setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
                 tables = tables_of(setting, self._workers, contrast=True)
                 witness_px, model, lessons = self._solver.by_contrast(volume, tables), start, 0
-        # Lost stripes prove no halo: without one, nothing has to be learned by contrast.
+        # Lost stripes prove no halo. Without a halo, nothing has to be learned by contrast.
         return misled if witness_px is not None and not (model.halo.any() or misled.halo.any()) else model
 
     def _adapted(
@@ -170,9 +170,9 @@ class Joint:
     ) -> RowModel | None:
         """The state of an earlier run, adapted to a first sweep; None if it does not explain the sweep's counts.
 
-        fresh: learned row by row from the sweep. A halo is taken over together with everything else, but only if that
-        explains the counts better, since a single row cannot tell it from haze. Without a halo, the line's width and
-        the brightness of stripes are taken over if the medium is still the same.
+        fresh: learned row by row from the sweep. A state with a halo is taken over whole, but only if it explains the
+        counts better than `fresh`, since a single row cannot tell a halo from haze. From a state without a halo, the
+        line's width and the brightness of stripes are taken over if the medium is still the same.
         """
         lines = lines_of(volume, next_lattice(geometry))
 
@@ -194,7 +194,7 @@ class Joint:
     ) -> tuple[RowModel, float]:  # fmt: skip
         """The model learned from stripes that are estimated with `model`, and the share of answers that teach it.
 
-        intensity: of the volume. witness_px: of `MapSolver.by_contrast`; stripes off it by over AGREE_PX are left out.
+        intensity: of the volume. witness_px: of `by_contrast`, or None; stripes over AGREE_PX from it are left out.
         """
         before, solver = model, self._solver
         setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
@@ -222,9 +222,9 @@ class Joint:
 
 @dataclass(slots=True, eq=False)
 class MapWork:
-    """A map under way: counts, the model and its tables, and a solver. used: the model with the prior's memory.
+    """A map under way: counts, the model and its tables, and a solver.
 
-    stripes: None until `run` has made them.
+    used: the model with the last map's labels, if they are a prior. stripes: None until `run` has made them.
     """
 
     sweep: CountVolume

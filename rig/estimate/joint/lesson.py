@@ -1,20 +1,19 @@
-"""Reads a map's answers and what can be learned from them, compiled: positions, trust in each, and quiet pixels behind
-them.
+"""Reads a map's answers and what can be learned from them, compiled: positions, trust in each, and the counts of quiet
+pixels, which lie behind a stripe and show the ambient light.
 
 When the model is learned from the first map, each answer counts with a trust (`fill_trust`, float32 (rows, columns)):
 
     trust = erf(3 px / (sqrt 2 sd)) / (1 + exp(A - B margin)) / (1 + C z^-D)
 
-with the margin in cost divided by UNITS. This is the confidence of `rig.estimate.joint.confidence` with three changes.
-First, z takes the place of contrast': the light of the stripe above the mean of the haze before and behind it, divided
-by its noise, both pooled over neighbours. Second, it does not matter whether the answers around agree. Third, the
-answer need only be on the right surface, within 3 px. Lessons from later maps use the confidence of the stripe table,
-since the model is known by then.
+with the margin in cost divided by UNITS. This is a simpler form of the confidence of `rig.estimate.joint.confidence`,
+with other constants. z takes the place of contrast': the light of the stripe above the mean of the haze before and
+behind it, divided by its noise, both pooled over neighbours. Other terms are left out. The answer need only be on the
+right surface, within 3 px. Lessons from later maps use the confidence of the stripe table: the model is known by then.
 
 B, C and D are fitted by maximum likelihood to lessons on random scenes of a second simulator, in clear air, thin and
-dense fog, under a halo and with hot pixels at 1 to 10 exposures, with places without a stripe counted as wrong. A is
-half of its fitted value, because too little trust makes a worse model: an answer without trust is judged by its own row
-alone, and it is the answers with too little trust that show what the model does not know yet.
+dense fog, under a halo and with hot pixels at 1 to 10 exposures; answers where there is no stripe counted as wrong. A
+is half of its fitted value, because too little trust makes a worse model: an answer without trust is judged by its own
+row alone, and it is the answers with too little trust that show what the model does not know yet.
 """
 
 import math
@@ -48,9 +47,9 @@ def fill_trust(
     x_px: Float32, sd_px: Float32, n_frames: Int32, margin: Uint8, places: Places, ambient: float, first_row: int,
     last_row: int, trust: Float32,
 ) -> None:  # fmt: skip
-    """Fill trust, 0 to 1, of rows first_row..last_row-1, 0 where x_px is NaN; arrays (rows, columns).
+    """Fill trust (rows, columns), 0 to 1, of rows first_row..last_row-1; 0 where x_px is NaN.
 
-    ambient: usual ambient light, photons per exposure and pixel.
+    margin: of `LabelAnswers`. ambient: usual ambient light, photons per exposure and pixel.
     """
     amplitudes, scales, hazes = places.amplitude, places.scale, places.haze
     for y in range(first_row, last_row):
@@ -81,8 +80,8 @@ def read_positions(
 ) -> None:  # fmt: skip
     """Fill x_px (rows, columns) from the answers' labels, and distance = x_px - x_far; NaN without data.
 
-    An answer in the outer half of the first or last of `width` pixels gets margin 0 in `answer`. A stripe beyond that
-    pixel has no label and leaves the row dark. In a dark row the outermost label seems far better than all others.
+    An answer beyond the middle of the first or last of `width` pixels gets margin 0 in `answer`. A stripe outside the
+    picture has no label and leaves the row dark. In a dark row the outermost label seems far better than all others.
     """
     label, margin, nothing = answer.label, answer.margin, np.float32(np.nan)
     for y in range(first_row, last_row):
@@ -101,10 +100,10 @@ def add_quiet(
 ) -> None:  # fmt: skip
     """Add to quiet (2, rows, width) the ones and exposures of pixels behind clear stripes, every column_step columns.
 
-    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is no halo. With a
-    halo, light also falls behind a stripe of `signal` photons: the expected halo and pedestal are subtracted from the
-    ones. Pixels where both together exceed `most_light`, photons per exposure, are left out. So are stripes that
-    saturate their pixels: their halo is brighter than expected, and the excess would be taken for ambient light.
+    Pixels without a ray are left out. halo: (BINS, pixels) of `halo_shares`, without pixels if there is no halo. Under
+    a halo, the expected light of halo and haze behind a stripe of `signal` photons is subtracted from the ones. Pixels
+    where it exceeds `most_light`, photons per exposure, are left out. So are stripes that saturate their pixels: their
+    halo is brighter than expected, and the excess would be taken for ambient light.
     """
     width, several = sweep.u.shape[1], sweep.others.shape[1] > 0
     # Local names: each use of a tuple in the loop would count references to all of its arrays.

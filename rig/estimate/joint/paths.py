@@ -1,14 +1,14 @@
 """Four-path aggregation, compiled: the cost of each label, tied to the labels of the neighbours on rows and columns.
 
-A pixel, in this module, is one row and column of the map. Along a path, from the pixel q before p,
+A pixel, in this module, is one row and column of the map. With the cost C of a label, along a path from pixel q to p,
 
     L(p, l) = C(p, l) + m(p, l)
     m(p, l) = min(L(q, l), L(q, l +- 1) + P1, L(q, l +- 2) + P2, L(q, l +- 3) + P3, min L(q) + J) - min L(q)
 
 and the total of a label is C plus the messages m of the four paths, left, right, up and down (Hirschmueller, PAMI 30,
-2008, with steps of up to three labels). C, m and totals are uint8 (rows, columns, labels); all sums saturate at 255.
-`along_rows` leaves the messages of two paths; `along_columns` adds the other two and reads the answers from the totals
-(`rig.estimate.joint.winner`).
+2008, with steps of up to three labels). C and the sum of messages are uint8 (rows, columns, labels); all sums saturate
+at 255. `along_rows` sums the messages of two paths; `along_columns` adds the other two and reads the answers from the
+totals (`rig.estimate.joint.winner`).
 
 Labels stay in order in memory. Neighbouring labels are read by unaligned loads from the first-level cache, since
 shuffling them in registers gains nothing. Several paths are processed at once, because each step of a path waits for
@@ -26,7 +26,7 @@ from rig.simd.memory import address_of, keep_alive, load_bytes, prefetch, read_b
 from rig.simd.vectors import add_saturated_unsigned, smaller_unsigned, smallest_byte, sub_saturated_unsigned, zero_bytes
 
 _SIDE: Final = 2 * VECTOR
-"""Bytes before and behind the labels of a path, a cache line each. All are LARGEST but the least L, at _LEAST_AT."""
+"""Bytes before and behind the labels of a path, a cache line each: all LARGEST, but at _LEAST_AT lies the least L."""
 _LEAST_AT: Final = -VECTOR
 CHUNK: Final = 16
 """Columns that are stepped through together: enough that none waits for its last step, few enough for the caches."""
@@ -45,7 +45,7 @@ JUMP: Final = 40
 
 @numba.njit(cache=True, nogil=True)
 def _path_memory(paths: int, labels: int) -> Uint8:
-    """Memory for L of the last pixel and of this one on this many paths; keep it as long as its address is used."""
+    """Memory for L of the previous and of the present pixel on `paths` paths; keep it while its address is used."""
     return np.full(2 * paths * (labels + 2 * _SIDE) + _SIDE, LARGEST, np.uint8)
 
 
@@ -57,7 +57,7 @@ def _paths_in(memory):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
-    """Begin this number of paths: L is 0 before their first pixel, so that no message reaches it."""
+    """Begin this number of paths: L is 0 before their first pixel, so that their first message is 0."""
     for _ in range(2 * paths):
         for v in range(0, labels, VECTOR):
             store_bytes(path, v, zero_bytes())
@@ -67,11 +67,10 @@ def _begin(path, paths, labels):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _step(before, after, cost, message, total, hidden, labels, ahead, use):  # type: ignore[no-untyped-def]
-    """Step along a path: from L of the previous pixel, at `before`, to L of this one, at `after`. All are addresses.
+    """Step along a path: from L of the previous pixel, at `before`, to L of this one, at `after`.
 
-    use: _SET writes the message to `message`, _ADD adds it there; _TOTAL adds it to `message` and cost and writes the
-    sum to `total`, LARGEST for labels that are `hidden`. ahead: bytes to the cost and message that are prefetched; 0:
-    none.
+    before to hidden: addresses. use: _SET writes the message to `message`, _ADD adds it there; _TOTAL writes the sum of
+    it, `message` and cost to `total`, LARGEST for `hidden` labels. ahead: bytes to what is prefetched, 0 for nothing.
     """
     least = zero_bytes() + read_byte(before, _LEAST_AT)
     most = add_saturated_unsigned(least, JUMP)

@@ -1,9 +1,9 @@
 """Sums of light over blocks of rows and columns at equal distances from the far end, compiled, for second returns.
 
-A block is BLOCK x BLOCK lines; a line is one row of one column. Lines are added at equal distances from the far end, in
-whole pixels (pixel 0 of distance is the leftmost), without the pixels near their stripes. Both the ones counted and
-those expected from haze and ambient light are added. With K frames of a line, and q and c the probabilities that a
-pixel stays dark under ambient light alone and under haze alone,
+A block is BLOCK x BLOCK lines; a line is one row of one column. Lines are added at equal distances from the far end of
+the depth range, in whole pixels (pixel 0 of distance is the leftmost), without the pixels near their stripes. Both the
+ones counted and those expected from haze and ambient light are added. With K frames of a line, and q and c the
+probabilities that a pixel stays dark under ambient light alone and under haze alone,
 
     ones expected = sum over lines K (1 - q c) = sum over columns K (number of lines - c sum q)
 
@@ -42,7 +42,7 @@ from rig.simd.vectors import LANES, where_below, zero_float32
 BLOCK: Final = 4
 """Rows and columns of a block; it is judged together with its eight neighbours."""
 LEFT_OUT: Final = np.float32(0.0)
-"""Value in `still` that marks pixels which are left out, since they always fire or must not be used."""
+"""Value in `still` (of `SecondLight`) of pixels that are left out: hot ones, and those that must not be used."""
 PLACE_X, PLACE_BEGIN, PLACE_END, PLACES = 0, 1, 2, 4
 NOWHERE: Final = -(1 << 15)
 """PLACE_X of a line where nothing is searched, see `line_places`."""
@@ -72,7 +72,7 @@ def line_places(sweep: Sweep, x_far: Float64, side: int, pixels: int) -> Int16:
     """Places of the lines of all rows and columns, int16 (rows, columns, PLACES); made once per model.
 
     PLACE_X: x of pixel 0 of distance, the leftmost of all `pixels`; NOWHERE if nothing is searched. PLACE_BEGIN,
-    PLACE_END: first pixel of distance that is searched and was stored, and the one after the last.
+    PLACE_END: first pixel of distance that is searched and was stored, and the one after the last; both 0 if none is.
     """
     rows, columns = x_far.shape
     out, width = np.zeros((rows, columns, PLACES), np.int16), sweep.u.shape[1]
@@ -97,8 +97,8 @@ def sum_lines(
 ) -> None:  # fmt: skip
     """Write the sums of a block to the addresses to_ones and to_expected.
 
-    inner: begin and end of the pixels in which all lines are left of their stripes, and of those in which all are right
-    of them. as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that a pixel stays
+    inner: begin and end of the pixels that lie left of the stripe in all lines, and of those that lie right of it in
+    all. as_bytes: whether counts are bytes, else float32. clear: address of the probabilities that a pixel stays
     dark under haze alone, left and right of the stripe.
     """
     none, order, one = zero_float32(), load_float32(table.order, 0), zero_float32() + np.float32(1.0)
@@ -184,8 +184,8 @@ def sum_blocks(
 ) -> None:  # fmt: skip
     """Fill the sums of rows of blocks first_block..last_block-1, without pixels within `apart` px of stripes x_px.
 
-    Haze is taken in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there. state,
-    still: see `SecondLight`; place: of `line_places`.
+    Haze is taken in the middle of HAZE_BLOCKS blocks, or of the block itself if nothing is searched there; if nothing
+    is searched there either, the sums are 0. state, still: see `SecondLight`; place: of `line_places`.
     """
     rows, columns = x_px.shape
     pixels, across, aside, x0 = out.ones.shape[2], out.ones.shape[1], np.float32(apart), sweep.x0
@@ -225,7 +225,7 @@ def sum_blocks(
 
 @numba.njit(forceinline=True)
 def _ask_for_block(seen: _Map, by: int, before: int) -> None:
-    """Prefetch the counts of the block after `before`, and places and stripes of the fourth block after it."""
+    """Prefetch the counts of the block after `before`, and places and stripes of the fourth one after `before`."""
     row_bytes, top = seen.window * seen.count_bytes, by * BLOCK
     for y in range(top, min(top + BLOCK, seen.rows)):
         there = y * seen.columns + (before + 4) * BLOCK
@@ -240,7 +240,7 @@ def _ask_for_block(seen: _Map, by: int, before: int) -> None:
 def _list_lines(
     seen: _Map, table: LineTable, by: int, bx: int, aside: np.float32, counts_size: int, still_size: int
 ) -> tuple[int, bool, tuple[np.float32, np.float32, np.float32, np.float32]]:
-    """Write the lines of a block that have pixels into the table.
+    """Write the lines of a block that have a stripe and pixels to add into the table.
 
     Returns their number, whether all their vectors can be read in place, and `inner` of `sum_lines`. counts_size,
     still_size: number of counts, and of values in `still` from pixel 0 of the first row on.
@@ -298,8 +298,8 @@ def _copy_lines(
 
 @numba.njit(cache=True, nogil=True)
 def _clear_beside(sweep: Sweep, state: RowState, y: int, c: int, start: int, side: int, clear: Float32) -> None:
-    """Fill clear (2, pixels + 1), the probability to stay dark under haze alone of pixels from `start` on, left and
-    right of a stripe.
+    """Fill clear (2, pixels + 1): the probability, left and right of a stripe, that pixels from `start` on stay dark
+    under haze alone.
 
     It is computed every HAZE_STEP pixels and interpolated linearly. A pixel without a ray has the value of the nearest
     pixel with a ray.

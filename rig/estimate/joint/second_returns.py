@@ -2,10 +2,10 @@
 
 A row has one stripe in the model, so the other line's light is searched for before and behind the stripe. In a single
 row it exceeds the haze by too little to be seen. So light is first summed over blocks of rows and columns
-(`rig.estimate.joint.second_return_blocks`) and compared, at each distance (in pixels) from the far end, with the light
-that is expected from haze and ambient light. Then each row is examined with its neighbours. Let own and block be the
-light of a candidate in standard deviations, pooled over its own neighbours and over its block's. The probability that
-it is right is
+(`rig.estimate.joint.second_return_blocks`) and compared, at each distance in px from the far end of the depth range,
+with the light that is expected from haze and ambient light. Then each row is examined with its neighbours. Let own and
+block be the light of a candidate in standard deviations, own pooled over its neighbours, block over its block and the
+blocks around. The probability that the candidate is right is
 
     logit confidence2 = LOG_ODDS . (1, own, block)
 
@@ -37,7 +37,7 @@ RING_PX: Final = 4
 GAP_PX: Final = 1
 """Pixels between the candidate's light and the ring."""
 LEAST_RING: Final = 0.25
-"""Least ratio of the light expected per pixel on each side of the ring to the candidate's: else too few are seen."""
+"""Least ones expected per pixel on each side of the ring, as a share of the candidate's: else too few were seen."""
 STEEPER: Final = 1.5
 """Factor on the excess haze of the ring's brighter side: haze is not linear between both sides."""
 CANDIDATE: Final = np.float32(4.0)
@@ -66,8 +66,8 @@ class Seconds(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN if there is no candidate; ones, expected: ones counted and expected within
-    the line's reach of the candidate; light: ones - expected; moment: the same, each pixel's multiplied by its distance
-    from the candidate in px; moved: see `move_seconds`.
+    the line's reach of the candidate; light: ones - expected; moment: sum of each pixel's light times its distance from
+    the candidate in px; moved: see `move_seconds`.
     """
 
     distance: Float32
@@ -80,7 +80,7 @@ class Seconds(NamedTuple):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def find_candidates(blocks: Blocks, reach: int, side: int, first_block: int, last_block: int, out: Candidates) -> None:
-    """Find the candidates of rows of blocks first_block..last_block-1. reach: half-width of the line's light, px."""
+    """Find the candidates of block rows first_block..last_block-1. reach: of `SecondLight`; side: of `LabelGrid`."""
     rows, columns, pixels = blocks.ones.shape
     three = np.zeros((2, columns, pixels), np.float32)
     nine, above = np.zeros((2, pixels + 2 * _AROUND), np.float32), np.empty(pixels, np.float32)
@@ -119,8 +119,8 @@ def _add_lines(first: int, apart: int, number: int, size: int, total: int) -> No
 
 @numba.njit(cache=True, nogil=True)
 def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
-    """Write by how much the light around each pixel exceeds CANDIDATE standard deviations to `excess`, and return the
-    largest excess. room, excess: addresses."""
+    """Write to `excess` by how many ones the light around each pixel exceeds CANDIDATE standard deviations. Returns the
+    largest excess, at least 0. room, excess: addresses."""
     row, most = pixels + 2 * _AROUND, zero_float32()
     for i in range(0, pixels, LANES):
         ones, expected = zero_float32(), zero_float32()
@@ -136,9 +136,9 @@ def _light_above(room: int, pixels: int, reach: int, excess: int) -> np.float32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
-    """Light around i above the haze that its ring shows, in standard deviations, and that haze over the learned one.
+    """Light around i above the haze that its ring shows, in standard deviations, and ratio of that haze to the learned.
 
-    (0, 1) if too few pixels of the ring were seen (LEAST_RING).
+    (0, 1) if too few pixels of the ring were seen (LEAST_RING). sums[0]: ones; sums[1]: ones expected.
     """
     n, e = sums[0, i - reach : i + reach + 1].sum(), sums[1, i - reach : i + reach + 1].sum()
     more = 1.0
@@ -157,9 +157,10 @@ def measure_seconds(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, x_far: Float64, side: int,
     apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: Seconds,
 ) -> None:  # fmt: skip
-    """Fill ones, expected, light and moment of rows first_row..last_row-1: 0 near a stripe and without a candidate.
+    """Fill ones, expected, light and moment of rows first_row..last_row-1 for candidates at `out.distance`.
 
-    state, still: see `SecondLight`; haze: of `Candidates`.
+    Pixels near the stripe are left out. 0 without candidate or stripe. state, still, apart, reach: see `SecondLight`;
+    haze: of `Candidates`.
     """
     width = sweep.u.shape[1]
     alone = still[LANES:-LANES].reshape(sweep.u.shape)
@@ -195,8 +196,8 @@ def measure_seconds(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
-    """Fill moved, the distance of each candidate moved to the centroid of the light around it, pooled over neighbours,
-    by at most `reach` px."""
+    """Fill moved: each candidate's distance after a shift by up to `reach` px to the centroid of the light around it,
+    pooled over neighbours."""
     moved = seconds.moved
     distance = with_margin(seconds.distance, first_row, last_row)
     moment, light = with_margin(seconds.moment, first_row, last_row), with_margin(seconds.light, first_row, last_row)
@@ -245,12 +246,12 @@ LIGHT_SIGMAS = 1.5
 
 
 class SecondLight(NamedTuple):
-    """Inputs of the search for second returns from a model; made once per model by `second_light`.
+    """What the search for second returns needs of a model; made once per model by `second_light`.
 
-    state: without ambient light. still: float32, (rows x width) between LANES numbers at either end, the probability
-    that a pixel stays dark under ambient light alone; LEFT_OUT for pixels that always fire or must not be used, which
-    show neither haze nor stripes. place: of `line_places`. apart: px from a stripe within which light counts as its
-    own. reach: px to either side of a candidate over which its light is summed.
+    state: without ambient light. still: float32, (rows x width) between LANES zeros at either end, the probability that
+    a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not be
+    used. place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either
+    side of a candidate over which its light is summed.
     """
 
     state: RowState
@@ -261,7 +262,7 @@ class SecondLight(NamedTuple):
 
 
 def second_light(state: RowState, line_sigma_px: float, grid: LabelGrid, sweep: Sweep) -> SecondLight:
-    """The inputs of the search under `state`, for a line of this width."""
+    """The inputs of the search under `state`, for a line of this standard deviation."""
     still = np.where(hot_in_bands(state.ambient), LEFT_OUT, np.exp(-state.ambient))
     return SecondLight(
         state._replace(ambient=np.zeros_like(state.ambient)),

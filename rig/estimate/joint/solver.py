@@ -1,7 +1,7 @@
 """From the counts of one map to its stripes, with tables that are given: the steps of `joint` that learn nothing.
 
-A `MapSolver` owns the memory that these steps need, some hundred bytes for each label of a map, and uses it again for
-the next map. Several solvers work on several maps at the same time.
+A `MapSolver` owns the memory that these steps need, and uses it again for the next map: for every row and column two
+bytes per label and about a hundred bytes more. Several solvers can work on several maps at the same time.
 """
 
 from dataclasses import replace
@@ -62,7 +62,7 @@ def memory_for(grid: LabelGrid) -> Memory:
 
 
 class MapSolver:
-    """Estimates one map at a time, on the threads of `workers`. prior: added to the costs, None for none."""
+    """Estimates one map at a time, on the threads of `workers`. prior: added to the costs, if there is one."""
 
     def __init__(self, workers: RowWorkers, prior: TemporalPrior | None = None) -> None:
         self._workers = workers
@@ -72,7 +72,7 @@ class MapSolver:
 
     @property
     def places(self) -> Places:
-        """The places of the last map, at which its light was measured."""
+        """Places of the last map's stripes, with the light measured there. Call it only after a map."""
         assert self._memory is not None, "a map has been estimated"
         return self._memory.places
 
@@ -85,7 +85,7 @@ class MapSolver:
         return replace(first, x2_px=x2_px, confidence2=confidence2)
 
     def stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
-        """The stripe table of a map, without second returns. lesson: only for learning, so placed less finely."""
+        """Stripe table of a map without second returns. lesson: only for learning; stripes are placed less finely."""
         grid, workers, memory = tables.grid, self._workers, self._room(tables.grid)
         x_px = np.empty(grid.x_far.shape, np.float32)
         self._read(volume, tables, x_px)
@@ -103,7 +103,7 @@ class MapSolver:
         return x_px
 
     def teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The stripe table with the trust of `fill_trust` in place of the confidence."""
+        """The last map's stripe table with the trust of `fill_trust` in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),
@@ -115,7 +115,7 @@ class MapSolver:
         return replace(stripes, confidence=trust)
 
     def seen(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Seen:
-        """The part of the map just estimated from which the next model is learned."""
+        """What the next model is learned from: a part of the last map. stripes: its stripe table."""
         quiet = self.quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
         bright = bright_lines(volume, tables, stripes, self.places, self._workers)
@@ -138,7 +138,7 @@ class MapSolver:
     def _read(self, volume: CountVolume, tables: JointTables, x_px: Float32, *, alone: bool = False) -> None:
         """Fill x_px (rows, columns) with the positions of the best labels, and the answers in memory.
 
-        The last step is only queued. alone: whether costs are those of contrast alone.
+        The last step, which writes x_px, is only queued. alone: whether costs are those of contrast alone.
         """
         grid, workers = tables.grid, self._workers
         rows, columns = x_px.shape
@@ -187,7 +187,7 @@ class MapSolver:
         return memory
 
     def _cost_rooms(self, tables: JointTables) -> dict[int, tuple[CostRoom, CostRoom]]:
-        """Memory for costs and `pointers` to it, kept for each thread by its first row: making them takes 0.5 ms."""
+        """Memory for costs and `pointers` to it, by the first row of the thread using it; making it takes 0.5 ms."""
         if self._rooms is None or self._rooms[0] is not tables:
             self._rooms = tables, {}
         return self._rooms[1]

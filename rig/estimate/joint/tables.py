@@ -19,15 +19,15 @@ from rig.simd import Float32
 from rig.threads import RowWorkers
 
 MOST_BYTES = 4 << 30
-"""Most that costs and messages of all maps under way may take: room for a map of 1000 columns, each searched over all
-of 1024 x 1024 pixels. Tables of a halo come on top, half as much in that case."""
+"""Most bytes that costs and messages (`rig.estimate.joint.paths`) of all maps under way may take: room for a map of
+1000 columns, each searched over all of 1024 x 1024 pixels. Tables of a halo would take half as much in addition."""
 
 
 class JointTables(NamedTuple):
     """Everything that is made once per model, with its inputs; see the module that makes each.
 
-    shares: of `profile_table`. halo: of `halo_shares`, without pixels if there is no halo. dark: whether there are dark
-    frames.
+    contrast: None if not needed. shares: of `profile_table`. halo: of `halo_shares`, without pixels if there is no
+    halo. dark: whether there are dark frames.
     """
 
     grid: LabelGrid
@@ -46,7 +46,7 @@ class JointTables(NamedTuple):
 
 
 def bytes_of(grid: LabelGrid) -> int:
-    """Memory that costs and messages of a map take."""
+    """Bytes that costs and messages of a map take."""
     rows, columns = grid.x_far.shape
     return int(2 * rows * columns * grid.labels)
 
@@ -65,7 +65,7 @@ def grid_of(geometry: SweepGeometry) -> LabelGrid:
 
 
 def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool = False) -> JointTables:
-    """The tables of a model, for a geometry and a number of exposures per column.
+    """The tables of a model, for a geometry and a number of exposures per column. Raises UsageError as `grid_of`.
 
     contrast: whether to make tables for costs of contrast; under a halo they are always made.
     """

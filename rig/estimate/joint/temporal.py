@@ -33,7 +33,7 @@ class TemporalPrior:
     """Memory of the last map for the next one. on: whether maps are kept.
 
     before: uint16 (2, rows, columns), the last map's labels and the largest cost added to others (0: no prior). None if
-    nothing is known, as after a map without frames and before the first map of a geometry.
+    nothing is known, as after a map without confident answers and before the first map of a geometry.
     """
 
     def __init__(self, on: bool) -> None:
@@ -43,11 +43,11 @@ class TemporalPrior:
         self._ramps: Uint8 | None = None
 
     def recall(self, before: NDArray[np.uint16] | None) -> None:
-        """Continue from the state that was kept with a map."""
+        """Continue from the state `before` that was kept with a map; None: forget the last map."""
         self.before, self._of = before, None
 
     def begin(self, geometry: SweepGeometry, grid: LabelGrid) -> None:
-        """Prepare for a map's costs. A map of another geometry is forgotten."""
+        """Prepare for a map's costs. A last map of another geometry is forgotten."""
         if self.before is not None:
             other = self._of is not None and self._of is not geometry
             if other or self.before.shape[1:] != grid.x_far.shape:
@@ -62,7 +62,7 @@ class TemporalPrior:
             _add_ramps(self.before, volume.n_frames, self._ramps, first, last, cost)
 
     def leave(self, stripes: StripeTable, grid: LabelGrid) -> None:
-        """Keep the part of a map that the next one uses."""
+        """Keep the part of a map that the next one uses, or nothing if not `on`."""
         if not self.on:
             self.before = None
             return
@@ -87,7 +87,7 @@ def _ramps(labels: int) -> Uint8:
 def _add_ramps(
     before: NDArray[np.uint16], n_frames: Int32, ramps: Uint8, first_row: int, last_row: int, cost: Uint8
 ) -> None:
-    """Add each pixel's ramp to its costs; labels: a multiple of VECTOR."""
+    """Add the ramp of each row and column to its costs; the number of labels is a multiple of VECTOR."""
     _, columns, labels = cost.shape
     costs, table = address_of(cost), address_of(ramps)
     for y in range(first_row, last_row):

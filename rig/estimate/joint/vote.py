@@ -1,15 +1,15 @@
-"""Vote on weak answers of the aggregation, compiled: all neighbours decide together.
+"""Vote on weak answers of `rig.estimate.joint.paths`, compiled: all neighbours decide together.
 
 Four paths carry evidence along rows and columns only. If few photons come back, single rows or columns are wrong as a
-whole and form streaks. So an answer whose margin is below WEAK is put to the vote. Candidates are its own label and
-those of the four nearest neighbours; the winner is the one with the least
+whole and form streaks. So an answer is put to the vote if its margin, by which the next best position costs more, is
+below WEAK. Candidates are its own label and those of the four nearest neighbours; the winner is the one with the least
 
     sum over 5 x 5 neighbours n of margin_n min(|label - label_n|, FAR),
 
-unless its cost from the row's own counts exceeds that of the old label by more than OBJECTION. The new margin is the
-sum of the neighbours' margins for the label, less the sum of those for other labels, divided by the number of
-neighbours and at least 0. So where streaks disagree, margins are small. Labels are int16, margins uint8 in units of
-cost; sums fit 16 bits (SHARE).
+unless its cost from the row's own counts exceeds that of the old label by more than OBJECTION; then the old one stays.
+The new margin is the sum of the margins of neighbours within SAME of the label, less that of all others, divided by the
+number of neighbours (the answer included) and at least 0. So where streaks disagree, margins are small. Labels are
+int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
 """
 
 from typing import Final, NamedTuple
@@ -45,9 +45,9 @@ NOWHERE: Final = 30000
 
 
 class Ballots(NamedTuple):
-    """Labels and votes of a map, with a margin of at least REACH rows and columns without votes on every side.
+    """Labels and votes of a map, with a border of at least REACH rows and columns without votes on every side.
 
-    label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin over SHARE.
+    label: float32 as answered; whole: int16, the nearest integer; votes: int16, the margin divided by SHARE.
     """
 
     label: Float32
@@ -92,8 +92,8 @@ _CANDIDATES: Final = 5
 class _Hall(NamedTuple):
     """Arrays that a vote reads and writes; kernels get `pointers` to them.
 
-    elected: int16 (width,), for each of a row's answers first the candidate, then the label. against: int16
-    (candidates, LANES). share: float32 (width,), 1 over the number of voting columns. width: of the ballots.
+    elected: int16 (width,), for each of a row's answers first the candidate's number, then the label. against: int16
+    (candidates, LANES). share: float32 (width,), 1 / the number of voting columns. width: of the ballots.
     """
 
     ballots: Ballots
@@ -183,7 +183,7 @@ def _settle_row(hall: _Hall, y: int, high: int) -> None:
 
 @numba.njit(forceinline=True)
 def _weak_lanes(votes, at, end):  # type: ignore[no-untyped-def]
-    """A number with a bit for each of LANES answers, set if the answer is weak; there are no answers from `end` on."""
+    """A number with a bit for each of LANES answers, set if the answer is weak; never set from answer `end` on."""
     strong = equal_mask(smaller(load_int16(votes, at), np.int16(WEAK // SHARE)), np.int16(WEAK // SHARE))
     return ~np.int64(strong) & ((1 << min(LANES, end)) - 1)
 
@@ -196,7 +196,7 @@ def _step(width, k):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _count_votes(whole: int, votes: int, at: int, width: int, room: int) -> None:
-    """Write votes against each candidate of LANES answers to room (candidates, LANES); all addresses."""
+    """Write the votes against each candidate to room (candidates, LANES). whole, votes, room: addresses."""
     own, left, right = load_int16(whole, at), load_int16(whole, at - 1), load_int16(whole, at + 1)
     above, below = load_int16(whole, at - width), load_int16(whole, at + width)
     a = b = c = d = e = zero_int16()
@@ -220,7 +220,7 @@ def _apart(label, other):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _elect(against):  # type: ignore[no-untyped-def]
-    """The first candidate of each lane with the least against it."""
+    """Number of each lane's candidate with the fewest votes against it, the first of equal ones."""
     none, least = zero_int16(), load_int16(against, 0)
     best = none
     for k in range(1, _CANDIDATES):
@@ -233,7 +233,7 @@ def _elect(against):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _count_support(whole: int, votes: int, at: int, width: int, elected: int, room: int) -> None:
-    """Write votes for the elected labels of LANES answers less those for others to `room`; all addresses."""
+    """Write the votes for elected labels, less those for others, to room (LANES,). All but at and width: addresses."""
     own, none = load_int16(elected, 0), zero_int16()
     support, total = none, none
     for line in range(at - REACH * width, at + REACH * width + 1, width):

@@ -1,12 +1,12 @@
-"""Answers read from the totals of all labels, compiled: sub-label position and margin of each pixel.
+"""Answers read from the totals of all labels, compiled: sub-label position and margin of each row and column.
 
-With S(l) the totals of a pixel (uint8, LARGEST if a label is excluded) and l* the label with the least total,
+With S(l) the totals of a row and column (uint8, LARGEST if a label is excluded) and l* the label with the least total,
 
     label  = sum of l w(l) / sum of w(l) over |l - l*| <= r,     w(l) = exp(-BETA (S(l) - S(l*)) / UNITS)
     margin = min of S(l) over |l - l*| >= MARGIN_FROM  -  S(l*)
 
-r is REACH, or less if labels on either side are excluded. label is float32, margin uint8, (rows, columns). Several
-columns of a row are read at a time, in short steps for all of them, so that others proceed while one waits.
+r is REACH, or the largest distance up to which no label on either side is excluded. label is float32, margin uint8,
+(rows, columns). Several columns of a row are read at a time, in short steps for all: while one waits, others go on.
 """
 
 from typing import Final, NamedTuple
@@ -46,9 +46,8 @@ VECTOR: Final = 32
 """Labels that are processed at once."""
 MIDDLE: Final = VECTOR // 2
 UNITS: Final = 8.0
-"""Units of cost per nat with very few exposures; with K exposures there are UNITS / (1 + K / SHARP), see
-`rig.estimate.joint.labels.costs`.
-"""
+"""Units of cost per nat with very few exposures; with K exposures there are UNITS / (1 + K / SHARP) or less, see
+`rig.estimate.joint.labels.costs`."""
 
 
 BETA: Final = 0.5
@@ -56,11 +55,11 @@ BETA: Final = 0.5
 
 
 class AnswerSettings(NamedTuple):
-    """Tables of `answer_settings`, and the number of labels: 0..stripes-1 are positions, those behind are padding.
+    """Tables of `answer_settings`. stripes: labels 0..stripes-1 are positions, those behind are padding.
 
     weights: float32 (256,), by a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
-    the distance for each reach, 0 at taps beyond it. reach: uint8 (2^TAPS,), the reach if the taps of the set bits are
-    excluded. near: uint8 (VECTOR,) with the winner at MIDDLE, LARGEST for labels that do not count for the margin.
+    the distance for each r, 0 beyond it. reach: uint8 (2^TAPS,), r if those of the TAPS labels around the winner whose
+    bits are set are excluded. near: uint8 (VECTOR,), LARGEST for labels too near a winner at MIDDLE to be its rivals.
     """
 
     stripes: int
@@ -73,9 +72,9 @@ class AnswerSettings(NamedTuple):
 class LabelAnswers(NamedTuple):
     """Answers of a map, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
 
-    label: float32, mean of the labels around the one with the least total (the smaller of equal ones). The mean extends
-    only as far as both sides have labels, since a single side would draw every answer to it. margin: uint8, the least
-    total at least MARGIN_FROM labels away minus the winner's.
+    label: float32, weighted mean of the labels around the winner, the smallest label with the least total. The mean
+    extends only as far as both sides have labels, since a single side would draw every answer to it. margin: uint8, the
+    least total at least MARGIN_FROM labels away minus the winner's.
     """
 
     label: Float32
@@ -110,8 +109,8 @@ class Readout(NamedTuple):
 
     end: labels up to the end of the last block with stripes; size: bytes from the totals of a column to the next.
     around: uint8, totals of the columns, with at least a vector of LARGEST before and after each; totals: address of
-    the first one's. hidden: uint8 (labels,), LARGEST for padding. Per column: least_label: int32,
-    label of the least total; least: uint8, that total; moments: float32 (columns, POWERS), sums of weight times power.
+    the first column's. hidden: uint8 (labels,), LARGEST for padding. Per column: least_label: int32, label of the least
+    total; least: uint8, that total; moments: float32 (columns, POWERS), sums of weight times power.
     """
 
     settings: AnswerSettings
@@ -166,7 +165,7 @@ def _find_winners(columns, desk):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _weigh(columns, desk):  # type: ignore[no-untyped-def]
-    """Sum weight times each power over the labels around the winners, as far as both sides have some."""
+    """Sum weight times each power over the labels around the winners, as far as both sides have labels."""
     settings = desk.settings
     for c in range(columns):
         around = desk.totals + c * desk.size + read_int32(desk.least_label, c)

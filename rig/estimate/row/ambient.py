@@ -1,4 +1,4 @@
-"""Ambient light and dark counts of every pixel, from dark frames, quiet pixels behind stripes and sums over columns.
+"""Ambient light and dark counts of every pixel, from dark frames, pixels behind stripes and sums over columns.
 
 For each pixel both are constant during a sweep. So the counts summed over all columns show hot pixels, whatever the
 scene: over the whole sweep they fire far more often than their neighbours. If there are few counts, the estimate is
@@ -28,8 +28,8 @@ def ambient_map(
     """Ambient light and dark counts of each pixel in photons per exposure, (rows, width).
 
     intensity: (rows, width), ones of each pixel while inside the stored window. quiet: (2, rows, width), ones and
-    exposures of each pixel while clearly behind the stripe; None before any stripe is known. These ones may be negative
-    if the expected light of a halo was subtracted.
+    exposures of each pixel while clearly behind the stripe; None before any stripe is known. With several lines it is
+    not used. quiet[0] may be negative if the expected light of a halo has been subtracted.
     """
     ones = np.zeros((geometry.rows, geometry.width))
     exposures = np.zeros_like(ones)
@@ -38,7 +38,6 @@ def ambient_map(
         exposures += tally.n_dark if tally.dark_frames is None else tally.dark_frames
     # With several lines, a pixel behind one line's stripe may be lit by another line.
     if quiet is not None and geometry.others is None:
-        # The expected light of a halo has been subtracted: by chance the difference may be negative.
         ones += np.maximum(quiet[0], 0.0)
         exposures += quiet[1]
     totals = np.stack([intensity, np.broadcast_to(_window_exposures(tally, geometry), intensity.shape)])
@@ -62,7 +61,7 @@ def _window_exposures(tally: FrameTally, geometry: SweepGeometry) -> NDArray[np.
 
 
 def _lowest_level(totals: NDArray[np.uint32]) -> float:
-    """A level below which hardly any pixel lies: half the flux at the 2nd percentile of the pixels' mean rates."""
+    """A level below which hardly any pixel lies: half the flux at the 2nd percentile of the rates, at least 1e-5."""
     seen = totals[1] > 0
     if not seen.any():
         return 1e-5
@@ -71,7 +70,7 @@ def _lowest_level(totals: NDArray[np.uint32]) -> float:
 
 
 def _shrunk(ones: Float64, exposures: Float64) -> Float64:
-    """Flux of each pixel, drawn to the local mean, more strongly if pixels are more alike (empirical Bayes)."""
+    """Flux of each pixel, drawn to the local mean, more if pixels are alike (empirical Bayes). Outliers stay."""
     row_rates = ones.sum(1)[exposures.sum(1) > 0] / exposures.sum(1)[exposures.sum(1) > 0]
     overall = max(float(np.median(row_rates)), 1e-6)
     mean = np.full(ones.shape, overall)
@@ -105,8 +104,8 @@ def hot_pixels(totals: NDArray[np.uint32]) -> Float64:
     around = cv2.medianBlur(rate, 5).astype(np.float64)
     expected = around * exposures
     excess = ones - expected
-    # Once in the sweep a stripe brighter than its neighbours' may cross the pixel: allow half as much light again as
-    # expected, or half of the median pixel's if that is less.
+    # Once in the sweep a stripe that is brighter here than beside may cross the pixel: allow half as much light again
+    # as expected, or half of the median pixel's if that is less.
     hot = excess > HOT_SIGMA * np.sqrt(expected + 1.0) + 0.5 * expected.clip(max=np.median(expected))
     excess_rate = np.clip(excess / np.maximum(exposures, 1.0), 0.0, 0.9999)
     return np.where(hot & (exposures > 0), -np.log1p(-excess_rate), 0.0)

@@ -1,10 +1,11 @@
 """Learns the row model from the counts of a sweep by expectation-maximisation over a lattice of rows and columns.
 
-A line, in this package, is one row of one column. In each round every line's posterior P(j) over positions gives the
-probability that a pixel lies before or behind the stripe: pixel t lies before it if the stripe is farther, with
-probability sum over j > t of P(j). Ones and exposures are added with these weights per bin of path inverse depth
-(`learn_rows`). Haze, pedestal (the level behind the stripe), gains, amplitudes and line width are then set from those
-float64 sums. Where data are few, haze is assumed to fall exponentially with the path length.
+A line here is one row of one column; only 'line width' and 'laser line' mean the laser's. In each round every line's
+posterior P(j) over positions gives the probability that a pixel lies before or behind the stripe: pixel t lies before
+it if the stripe is farther, with probability sum over j > t of P(j). Ones and exposures are added with these weights
+per bin of path inverse depth (`learn_rows`). Haze, pedestal (the level behind the stripe), gains and amplitudes are
+then set from these float64 sums; the line width is found by trial (`fit_line_width`). Where data are few, haze is
+assumed to fall exponentially with the path length.
 """
 
 from dataclasses import replace
@@ -80,8 +81,7 @@ class Expectation(NamedTuple):
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
-    """About `lines` (row, column) pairs spread evenly over those with a window, in a fixed pattern without
-    randomness."""
+    """Rows and columns (n,) of at most `lines` pairs, spread in a fixed pattern over those with a search window."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
@@ -122,7 +122,7 @@ def _some(lines: Lines, part: slice) -> Lines:
 
 
 def _every(lines: Lines, wanted: int) -> Lines:
-    """About `wanted` of the lines, evenly spread."""
+    """At least `wanted` of the lines, and fewer than twice as many, evenly spread; all if there are no more."""
     return _some(lines, slice(None, None, max(len(lines.row) // wanted, 1)))
 
 
@@ -151,7 +151,7 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
     for i in range(FIRST_ROUNDS):
         seen = expect(first, geometry, model, workers)
         model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
-        # A width that did not change is tried again only in the last two rounds, when the model is nearly known.
+        # A width that did not change is tried again only in the last two of these rounds: the model is nearly known.
         if moves or i >= FIRST_ROUNDS - 2:
             width = model.line_sigma_px
             model = fit_line_width(few, geometry, model, workers)
@@ -173,8 +173,8 @@ def learn_next(
 ) -> tuple[RowModel, Expectation]:
     """The model updated with lines of one more sweep, those of `next_lattice`, and the sums for the next call.
 
-    before: the sums returned by the previous call; they are multiplied by FADE. The line width is not changed if lines
-    have positions known from neighbours, since these depend on the width.
+    before: the sums returned by the previous call, None at first; they are multiplied by FADE. The line width is not
+    changed if lines have positions known from neighbours, since these depend on the width.
     """
     seen = expect(lines, geometry, model, workers)
     if before is not None:
@@ -200,7 +200,7 @@ def learn_again(
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:
-    """Change the line width by one step if that makes the counts clearly likelier."""
+    """The model with another line width, one step away, if that makes the counts clearly likelier; else as it is."""
     tried = [
         replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
     ]
@@ -286,7 +286,7 @@ def maximise(
     scale = stripe_scale(path_m, extinction)
     profile = np.stack([before, behind, scale, _position_prior(seen.levels)], 1).astype(np.float32)
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
-    # The stated extinction comes only from rows with a certain stripe: one taken for haze would flatten the decay.
+    # The stated extinction comes only from rows with a certain stripe: a stripe taken for haze would flatten the decay.
     clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
     if gains:
         model = replace(
@@ -321,9 +321,9 @@ def _split_rest(rest: Float64, variance: Float64, haze: Float64) -> tuple[float,
 
 
 def _level(sums: Float64) -> tuple[Float64, Float64]:
-    """Flux above ambient per unit geometry factor, and its variance, (BINS,); NaN in bins with few exposures.
+    """Flux above ambient at G = 1 (`rig.estimate.row.inputs`), and its variance, (BINS,); NaN with few exposures.
 
-    sums: (BINS, 4), ones, exposures, exposures times geometry factor, exposures times ambient flux.
+    sums: (BINS, 4), ones, exposures, exposures times G, exposures times ambient flux.
     """
     ones, exposures, geometric, ambient = sums.T
     few = exposures < 50
@@ -360,9 +360,9 @@ def _amplitudes(model: RowModel, mass: Float64, spread: bool) -> tuple[Float32, 
 
 
 def _position_prior(levels: Float64) -> Float64:
-    """Smoothed log density of stripes over the bins (BINS,), 0 where they are spread evenly.
+    """Log of the smoothed density of stripes over the bins (BINS,), relative to an even one.
 
-    It decides only in rows with hardly any photons. A quarter of it stays even, so no place loses more than 1.4 nats.
+    It decides only in rows with hardly any photons. A quarter of the density stays even: no place loses over 1.4 nats.
     """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     found, even = (np.convolve(np.pad(levels[:, i], 2), kernel, "valid") for i in (12, 13))
@@ -371,7 +371,7 @@ def _position_prior(levels: Float64) -> Float64:
 
 
 def _gain(gain: Float32, seen: Float64, ambient: float, before: Float64) -> Float32:
-    """Strength of the haze per row or column, smoothed over 65 of them; 1 on average. As it was if haze is weak.
+    """Strength of the haze per row or column, smoothed over 65 of them; 1 on average. Unchanged if haze is weak.
 
     seen: (n, 2), ones before the stripe and those expected with the present gain.
     """
@@ -391,12 +391,12 @@ CUT: Final = 0.05
 """Amplitudes, 'no stripe' and positions are learned from rows with less than this share of their prior beyond the
 picture's border."""
 CERTAIN: Final = 0.6
-"""The level behind the stripe is learned from rows with more than this probability within 1 px."""
+"""The level behind the stripe is learned from rows with more than this probability of a stripe within 1 px."""
 CLEAR: Final = 0.97
 CLEAR_PX: Final = 6
 """The extinction is learned from rows more certain than CLEAR, at pixels more than CLEAR_PX before their stripe."""
 LEAST_OWN: Final = 1e-3
-"""With several laser lines: least haze of a column's own line relative to that of the others; used if it is less."""
+"""With several laser lines: least haze of a column's own line relative to the others'; less counts as this much."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -408,9 +408,9 @@ def learn_rows(
 
     Rows that have no stripe with a probability of 0.5 or more add nothing to levels 0 to 11, rows_seen and
     columns_seen. Added to levels (bins, LEVELS), in columns:
-    - 0 to 3, of pixels before the stripe: ones, exposures, exposures times geometry factor, exposures times ambient
-      flux, all weighted by the probability that the pixel lies before the stripe;
-    - 4 to 7: the same of pixels behind the stripe, of rows more certain than CERTAIN;
+    - 0 to 3, of pixels before the stripe: ones, exposures, exposures times G (`rig.estimate.row.inputs`), exposures
+      times ambient flux, all weighted by the probability that the pixel lies before the stripe;
+    - 4 to 7: the same of pixels behind the stripe, of rows more certain than CERTAIN, other lines' haze as ambient;
     - 8 to 11: the same, unweighted, of pixels more than CLEAR_PX before the stripe of rows more certain than CLEAR;
     - 12 and 13: stripes, and stripes if all positions were equally likely (see CUT).
     Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Added to

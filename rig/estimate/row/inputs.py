@@ -49,7 +49,7 @@ TABLE = logit_table()
 
 
 class Sweep(NamedTuple):
-    """Geometry of a sweep; arrays as in SweepGeometry, with the depth range as inverse depths."""
+    """Geometry of a sweep, as in SweepGeometry. w_near, w_far: inverse depths. others: (columns, lines - 1, 3)."""
 
     window: int
     x0: Int32
@@ -102,7 +102,7 @@ class RowState(NamedTuple):
 
 
 class RowBuffers(NamedTuple):
-    """Buffers of one row, made once per thread. `row_fluxes` fills `before` to `log_prior`, `judge_line` all.
+    """Buffers of one row, used again for the next. `row_fluxes` fills `before` to `log_prior`, `judge_line` all.
 
     Pixels go from the nearest depth to the farthest. n: counts. before: flux of a pixel that lies before the stripe;
     behind: of one behind it. scale: stripe photons at amplitude 1. cell: nearest profile bin. gain: the factor G, by
@@ -170,7 +170,7 @@ def path_to_plane(px, py, pz, vy):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignore[no-untyped-def]
-    """Path from the camera to a plane's point, per unit of depth, the point's inverse depth, and its fractional bin."""
+    """Path from the camera to a plane's point, per unit of depth, the point's inverse depth, and fractional bin."""
     path_c = np.sqrt(np.float32(1.0) + ux * ux + vx * vx)
     w = px * ux + py * vx + pz
     return path_c, w, min(max((w * 2.0 / (path_p + path_c) - w_lo) * per_w, 0.0), bins - 1.001)
@@ -178,8 +178,7 @@ def profile_place(px, py, pz, ux, vx, path_p, w_lo, per_w, bins):  # type: ignor
 
 @numba.njit(inline="always")
 def flux_between(ambient, gain, one, other, part):  # type: ignore[no-untyped-def]
-    """Flux of ambient light plus gain times the profile, which is interpolated between the values `one` and `other` of
-    two successive bins; part: 0 at the first, 1 at the second."""
+    """Ambient flux plus gain times the profile, at `part` (0 to 1) of the way from bin value `one` to `other`."""
     return min(max(ambient + gain * (one + part * (other - one)), FLUX_MIN), FLUX_MAX)
 
 
@@ -250,8 +249,8 @@ def fluxes_at(sweep, state, y, x, c, path_p, strength):  # type: ignore[no-untyp
 def row_fluxes(sweep: Sweep, state: RowState, row: RowBuffers, y: int, c: int) -> tuple[int, int, int, int]:
     """Fill the buffers `before` to `log_prior` for row y of column c. They do not depend on the counts.
 
-    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t if near is left, else
-    x - t. The length is 0 if there is nothing to search.
+    Returns (length, first and last index that a stripe may have, x of index 0); pixel t is x + t if near_is_left,
+    else x - t. The length is 0 if there is nothing to search.
     """
     lo, hi, x0 = sweep.x_lo[y, c], sweep.x_hi[y, c], sweep.x0[c]
     if lo > hi:
@@ -294,8 +293,8 @@ def judge_line(
 ) -> tuple[int, int, int, int, float, float, float]:
     """Compute the posterior of line i and write it to `row`.
 
-    Returns the values of `row_fluxes`, then the probability of 'no stripe', the part of the prior that lies beyond the
-    picture's border, and the log evidence.
+    Returns the values of `row_fluxes` (length 0 also without exposures), then the probability of 'no stripe', the part
+    of the prior that lies beyond the picture's border, and the log evidence.
     """
     c = lines.column[i]
     length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)

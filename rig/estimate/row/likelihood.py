@@ -1,4 +1,4 @@
-"""The likelihood of one image row, exact: the specification of everything that `likelihood` and `joint` compute.
+"""The likelihood of one image row, exact: the specification of what `likelihood` and `joint` compute per row.
 
 Along a row, from near to far, the light is 'haze, stripe, then less'. The counts n_t of pixels t = 0..L-1 are ones in K
 one-bit frames. Hypothesis (j, m), 'the stripe is at pixel j with amplitude a_m', expects photons per exposure of
@@ -11,10 +11,10 @@ one-bit frames. Hypothesis (j, m), 'the stripe is at pixel j with amplitude a_m'
 A pixel fires with probability p' = (1 - e)(1 - exp(-flux)) + e/2; the floor e (FLOOR) bounds the evidence of a single
 pixel. Then
 
-    log-likelihood(j, m) = sum over t of n_t logit p'_t + K log(1 - p'_t)
+    log-likelihood(j, m) = sum over t of (n_t logit p'_t + K log(1 - p'_t))
 
 is linear in the counts, so that all positions of a row cost one cumulative sum (pixels before and behind j) and 2T + 1
-taps (pixels around j). Besides the stripes there are three hypotheses without one: the whole row lies before its
+taps (pixels around j) per amplitude. Three more hypotheses have no stripe in the row: the whole row lies before its
 stripe, or behind it, or its haze ends between two pixels and nothing shines there. With priors over positions and
 amplitudes,
 
@@ -46,14 +46,14 @@ CELL_BITS: Final = 8
 """`logit_table` spans fluxes from 2^EXPONENT_LOW to 2^EXPONENT_HIGH, with 2^CELL_BITS cells per octave."""
 TABLE_BASE: Final = np.uint32((127 + EXPONENT_LOW) << CELL_BITS)
 TABLE_SHIFT: Final = np.uint32(23 - CELL_BITS)
-"""A float32 shifted right by TABLE_SHIFT bits, less TABLE_BASE, is the number of its cell."""
+"""The bits of a float32 shifted right by TABLE_SHIFT, less TABLE_BASE, are the number of its cell."""
 FLUX_MIN: Final = np.float32(2.0**EXPONENT_LOW)
 FLUX_MAX: Final = np.float32(2.0**EXPONENT_HIGH * 0.999)
 """Smallest and largest flux in the table, photons per exposure and pixel."""
 LABEL_PX: Final = 0.25
 """Spacing of the sub-pixel positions around the most probable pixel."""
 LABELS: Final = 13
-"""Number of sub-pixel positions, up to 1.5 px each way: enough for the mean of a peak, without another peak."""
+"""Number of sub-pixel positions, up to 1.5 px each way: wide enough for a peak, too narrow for a second one."""
 LOST: Final = np.float32(24.0)
 """Hypotheses at least this many nats below the best are ignored (exp(-24) = 4e-11)."""
 
@@ -84,8 +84,8 @@ def add_evidence(
 ) -> None:
     """Add to score the log-likelihood of n ones in k frames at flux base + light * scale, less `own`.
 
-    Arrays are equally long, fluxes at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table index,
-    slices from zero.
+    Arrays but `table` are equally long, fluxes at least FLUX_MIN. Written for the vectoriser: no branch, unsigned table
+    index, slices from zero.
     """
     gain, loss = table[0], table[1]
     for t in range(score.shape[0]):
@@ -102,9 +102,9 @@ def row_scores(
     """Log-likelihood of every position and amplitude relative to 'everything is behind'.
 
     n: (length,) ones of the k exposures. psi: (T + 1,) share of the stripe at 0..T px from its centre. table: of
-    `logit_table`. Writes score (M, length); edge (length + 1,), the score of a change from before to behind at t
-    without any stripe; and taps (3, length): each pixel's log-likelihood if it lies before the stripe, the same behind
-    it, and the mean of its two fluxes.
+    `logit_table`. Writes score (M, length); edge (length + 1,), the score of a change from before to behind just in
+    front of pixel t, without a stripe; and taps (3, length): each pixel's log-likelihood if it lies before the stripe,
+    the same behind it, and the mean of its two fluxes.
     """
     n, before, behind, scale = n[:length], before[:length], behind[:length], scale[:length]
     near, far, middle = taps[0, :length], taps[1, :length], taps[2, :length]
@@ -137,7 +137,7 @@ def none_prior(
 ) -> tuple[float, float, float]:
     """The three priors `none` of `row_posterior`, from the part of the depth range that the picture shows.
 
-    near, far: ends of the depth range as inverse depths; w_first, w_last: those of the first and last position.
+    near, far: inverse depths of the ends of the depth range; w_first, w_last: of the first and last position.
     Positions beyond the picture's border are as likely, per inverse depth, as those in the picture.
     """
     span = near - far
@@ -159,9 +159,10 @@ def row_posterior(
 ) -> tuple[float, float]:  # fmt: skip
     """Fill `posterior` (length,), the probability of each position, and `by_amplitude` (M,), that of each amplitude.
 
-    none: prior of a row that lies entirely behind its stripe, of one that lies entirely before it, and of one whose
-    haze ends somewhere without a stripe. log_prior: of positions, up to a constant; log_weight: of amplitudes. Returns
-    the probability of 'no stripe' and the row's log evidence, relative to 'everything is behind'.
+    first, last: ends of the positions that a stripe may have; all others get 0. none: prior of a row that lies entirely
+    behind its stripe, of one entirely before it, and of one whose haze ends without a stripe. log_prior: of positions,
+    up to a constant; log_weight: of amplitudes. Returns the probability of 'no stripe' and the row's log evidence,
+    relative to 'everything is behind'.
     """
     mass = 0.0
     for j in range(first, last + 1):
@@ -209,7 +210,7 @@ def row_posterior(
 
 @numba.njit(cache=True, nogil=True)
 def mode_of(posterior: Float32, first: int, last: int) -> tuple[int, float]:
-    """Most probable position, the smaller index among equal ones, and the probability of lying within 1 px of it."""
+    """Most probable position, the smallest index among equal ones, and the probability of lying within 1 px of it."""
     mode = first
     for j in range(first, last + 1):
         if posterior[j] > posterior[mode]:

@@ -3,8 +3,8 @@
 Path inverse depth w (w' in `inputs`) is 1 over the mean of the two path lengths, scanner to point and point to camera.
 Haze that was scattered once depends on these two lengths only. So there are two profiles over BINS bins of w, haze
 before the stripe and the level behind it. Each is multiplied by the factor G of `inputs` (geometry, a gain per row and
-one per column). A stripe has a S(w) photons per exposure, where a is one of AMPLITUDES learned amplitudes (reflectance
-times laser power) and S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
+one per column). A stripe of amplitude a has a * S(w) photons per exposure. Amplitudes (reflectance times laser power)
+are AMPLITUDES learned values; S = w^2 exp(-2 extinction / w), scaled to 1 in the middle bin.
 
 The line is a Gaussian of learned width, integrated over pixels (`pixel_shares`).
 """
@@ -44,16 +44,17 @@ _SHAPES = {
 
 @dataclass(frozen=True, slots=True)
 class RowModel:
-    """Learned state of the row likelihood, enough to estimate any map again bit for bit.
+    """Learned state of the row likelihood, enough to estimate a map again bit for bit.
 
     profile: (BINS, 4) float32 over path inverse depth from w_lo in steps 1/per_w: haze before the stripe and level
-    behind it in photons per exposure and pixel at unit geometry factor, the stripe scale S, and the log prior of
-    positions. row_gain: (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows,
-    width) float32, photons per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at
-    S = 1 and their probability. none_weight: probability of a row without stripe. line_sigma_px: standard deviation of
-    the line's profile. extinction_per_m and its standard deviation: NaN if the haze does not determine it. halo:
-    (HALO_NODES, reaches) float32, light of the halo as a share of the stripe's (`rig.estimate.row.inputs`), 0 if there
-    is none. before: labels of the previous map as a prior (`rig.estimate.joint.temporal`), None if not used.
+    behind it in photons per exposure and pixel at G = 1, the stripe scale S, and the log prior of positions. row_gain:
+    (rows,) and column_gain: (columns,) float32, strength of the haze on each. ambient: (rows, width) float32, photons
+    per exposure of ambient light and dark counts. amplitude, weight: (AMPLITUDES,), photons at S = 1 and their
+    probability. none_weight: probability of a row without a stripe. line_sigma_px: standard deviation of the line's
+    profile. extinction_per_m: NaN if no haze could be fitted; its standard deviation is then NaN, too, and infinite if
+    the fit hardly depends on the extinction. halo: (HALO_NODES, reaches) float32, light of the halo as a share of the
+    stripe's (`rig.estimate.row.inputs`), 0 if there is none. before: uint16 (2, rows, columns), the previous map as a
+    prior (`rig.estimate.joint.temporal`), None if not used.
     """
 
     profile: Float32
@@ -79,8 +80,7 @@ class RowModel:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
         """The state from which `arrays` came, bit for bit. Raises KeyError if a field without a default is missing,
-        ValueError if one has another size than kernels expect.
-        """
+        ValueError if a field in _SHAPES has another shape."""
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)
@@ -109,12 +109,12 @@ def stripe_scale(path_m: Float64, extinction_per_m: float) -> Float64:
 
 
 def line_profile(sigma_px: float) -> Float32:
-    """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre; T = 2 to 6 covers 2.5 sigma."""
+    """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre, (T + 1,); T = 2 to 6 covers 2.5 sigma."""
     return pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
 
 
 def fine_profiles(sigma_px: float) -> Float32:
-    """Share of the line in pixels -R..R for centres a quarter pixel apart around 0, (LABELS, 2R + 1) float32."""
+    """Share of the line in pixels -R..R, R = T + 1, for LABELS centres LABEL_PX apart around 0, (LABELS, 2R + 1)."""
     reach = _reach(sigma_px) + 1
     centres = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
     return pixel_shares(sigma_px, np.arange(-reach, reach + 1) - centres[:, None])
@@ -125,7 +125,7 @@ def _reach(sigma_px: float) -> int:
 
 
 def pixel_shares(sigma_px: float, distance_px: Float64) -> Float32:
-    """Integral of a unit Gaussian over the pixels at the given distances."""
+    """Integral of a unit Gaussian over the pixels at the given distances from its centre."""
     erf = np.vectorize(math.erf, otypes=[np.float64])
     scale = 1.0 / (math.sqrt(2.0) * sigma_px)
     shares = erf((distance_px + 0.5) * scale) - erf((distance_px - 0.5) * scale)
@@ -134,7 +134,7 @@ def pixel_shares(sigma_px: float, distance_px: Float64) -> Float32:
 
 @dataclass(frozen=True, slots=True)
 class HazeFit:
-    """Exponential haze amplitude * exp(-2 extinction path), with the standard deviation of the extinction."""
+    """Haze amplitude * exp(-2 extinction path). The standard deviation of the extinction is infinite if unknown."""
 
     amplitude: float
     extinction_per_m: float
@@ -145,8 +145,8 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,). None if fewer than 4 bins are
     known or there is hardly any haze.
 
-    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and extinction
-    times path at the nearest bin at most at OPTICAL_DEPTH_MAX.
+    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and its
+    product with the path at the nearest bin at most at OPTICAL_DEPTH_MAX.
     """
     used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
     if used.sum() < 4:
@@ -159,7 +159,7 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
     candidates = np.concatenate([[0.0], np.geomspace(min(0.005, most), most, 60)])
 
     def fitted(extinction: float) -> tuple[float, Float64]:
-        """Best amplitude for an extinction, and the shape of the haze."""
+        """Best amplitude at the nearest bin for an extinction, and the shape of the haze, 1 there."""
         shape = np.exp(-2.0 * extinction * (s - s.min()))
         return float(np.sum(weight * shape * h) / np.sum(weight * shape**2)), shape
 

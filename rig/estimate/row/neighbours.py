@@ -1,7 +1,7 @@
 """Copies of maps with a margin: compiled code can compare each answer with those around it without checking bounds.
 
 Answers are compared by their distance in px from the position of their column's line at a fixed depth: neighbours whose
-distances differ by at most SAME_PX lie on one surface. Arrays are float32 (rows, columns).
+distances differ by at most SAME_PX count as on one surface. Arrays are float32 (rows, columns).
 """
 
 from typing import Final
@@ -23,7 +23,7 @@ COPIED_ROWS: Final = 32
 
 @numba.njit(cache=True, nogil=True)
 def with_margin(array: Float32, first_row: int, last_row: int) -> Float32:
-    """Copy of rows first_row..last_row-1 with MARGIN rows and at least LANES columns around; NaN outside the array."""
+    """Copy of rows first_row..last_row-1 with MARGIN rows and LANES or more columns around, NaN outside the array."""
     rows, columns = array.shape
     top, end = max(first_row - MARGIN, 0), min(last_row + MARGIN, rows)
     width = (-(-columns // LANES) + 2) * LANES
@@ -44,8 +44,8 @@ def on_surface(distance, light, here, width, reach):  # type: ignore[no-untyped-
     """For each of LANES answers, the number of answers on its surface up to `reach` rows and columns away, and the sum
     of their light.
 
-    distance, light: addresses of copies `with_margin` that are `width` wide; here: index of the first answer. An answer
-    counts itself; without a distance (NaN) the number is 0.
+    distance, light: addresses of copies from `with_margin`, `width` wide; here: index of the first answer. An answer
+    counts itself; if its distance is NaN, the number is 0.
     """
     own, number, lit, one = load_float32(distance, here), zero_float32(), zero_float32(), zero_float32() + 1.0
     for line in range(here - reach * width, here + reach * width + 1, width):

@@ -1,14 +1,15 @@
 """Close look at the best position of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
 It finds the position of the line within the pixel. LABELS positions (labels), LABEL_PX apart, are compared, one per
-lane of a vector. With L and R the flux left and right of the line, s the line's light, f_i,t its share in pixel t if it
-is at label i, and l_i,t the part of pixel t that lies left of label i,
+lane of a vector. Let L and R be the flux left and right of the line, s the line's light, f_i,t its share in pixel t if
+it is at label i, and l_i,t the part of pixel t that lies left of label i. With n_t ones of pixel t in K exposures,
 
-    score_i = K constant_i + sum over t of n_t weight_i,t,   from flux_i,t = l_i,t L + (1 - l_i,t) R + s f_i,t
+    score_i = K constant_i + sum over t of n_t weight_i,t    for fluxes l_i,t L + (1 - l_i,t) R + s f_i,t
 
-in units of 1 / (128 >> shift) octaves of likelihood, saturating int16. The position is the posterior mean over labels,
-float32. weight (int8) and constant (float32) are tabled over two fluxes, haze and line, two levels an octave; s is
-measured from the counts.
+Here weight_i,t is logit p' at that flux, constant_i the sum of log(1 - p'). Scores, saturating int16, have
+128 >> shift units an octave (factor of 2) of likelihood; shift is `close_shift` of `SearchTables`. The position is the
+posterior mean over labels, float32. weight (int8) and constant (float32) are tabled over the flux before the line and
+the line's light, two levels an octave. The first comes from the model, s is measured from the counts.
 """
 
 from typing import Final, NamedTuple
@@ -49,10 +50,11 @@ LOWEST_SCORE: Final = np.float32(-32000.0)
 class Closeup(NamedTuple):
     """Tables of the close look.
 
-    weight: int8 (LEVELS, LEVELS, 2, R + 1, LANES, 2) over haze, line, last bit of the pixel's index, pair of pixels
-    from `first_px` on, label, pixel of the pair: units per count; constant: float32 (LEVELS, LEVELS, LANES), units per
-    exposure. The mean over the labels is subtracted from both. Units are 128 >> shift an octave. label, square: float32
-    (LANES,), number of the label from the middle one, and its square, in the order UNPACKED.
+    weight: int8 (LEVELS, LEVELS, 2, reach + 1, LANES, 2), units per count, over the flux before the line, the line's
+    light, last bit of the pixel's index, pair of pixels from `first_px` on, label, pixel of the pair. reach: pixels on
+    either side that are looked at. constant: float32 (LEVELS, LEVELS, LANES), units per exposure. The mean over the
+    labels is subtracted from both. label, square: float32 (LANES,), number of the label from the middle one, and its
+    square, in the order UNPACKED; 0 for lanes without a label.
     """
 
     weight: NDArray[np.int8]
@@ -67,9 +69,9 @@ def label_weights(
 ) -> tuple[Float32, Float32]:
     """Weight of a count for each label, (LEVELS, LEVELS, F, LABELS), and of an exposure, (LEVELS, LEVELS, LABELS).
 
-    Both are in octaves of likelihood, with the mean over the labels subtracted. ambient: photons per exposure; share:
-    ratio of the pedestal to the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`;
-    table: `logit_table`.
+    Both are in octaves of likelihood, with the mean over the labels subtracted. LEVELS: of the flux before the line,
+    then of the line's light. ambient: photons per exposure; share: ratio of the pedestal (level behind the stripe) to
+    the haze; fine: (LABELS, F) as `fine_profiles` of `rig.estimate.row.model`; table: `logit_table`.
     """
     pixels = fine.shape[1]
     reach = (pixels - 1) // 2
@@ -125,9 +127,7 @@ def _cut(weight: Float32, units: int) -> Float32:
 
 @numba.njit(inline="always")
 def first_px(odd, reach):  # type: ignore[no-untyped-def]
-    """First pixel of the pairs that cover `reach` pixels around a pixel, relative to that pixel. odd: the pixel's last
-    bit.
-    """
+    """First pixel of the pairs that cover a pixel and `reach` on either side, relative to it. odd: its last bit."""
     return (odd - reach) // 2 * 2 - odd
 
 
@@ -154,7 +154,7 @@ def _level_of_each(flux):  # type: ignore[no-untyped-def]
 def label_scores(search, r, x, exposures, weight, constant, pairs):  # type: ignore[no-untyped-def]
     """Score of each label, 16-bit lanes, for a line near pixel x of row r of the batch.
 
-    weight: address of the weights of the two levels, for even x; constant: address of their constants; pairs: R + 1.
+    weight, constant: addresses of the two levels' weights, for even x, and of their constants; pairs: reach + 1.
     """
     n = search.n + r * search.n_bytes
     score = to_int16(larger_float(load_float32(constant, 0) * np.float32(exposures), LOWEST_SCORE))

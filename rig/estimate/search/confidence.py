@@ -6,9 +6,9 @@ counts of both look alike. Its neighbours can: on a surface their answers agree,
     confidence = 1 / (1 + exp(A - B ln odds - C asinh contrast + D ln K))
 
 - odds: (agree - 1/2) / (others + 1/2). agree: number of answers on this answer's surface, up to REACH rows and columns
-  away, itself included. Their distances from the position of the line at a fixed depth are the same within SAME_PX.
-  others: the number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive, it is
-  multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
+  away, itself included: their distances from the position of the line at a fixed depth differ from its own by at most
+  SAME_PX. others: number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive,
+  it is multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
 - contrast: mean light of the answers that agree, above ambient light and half the haze, less SPARED pixels of haze,
   divided by the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which
   take light of the haze for the stripe's.
@@ -16,7 +16,7 @@ counts of both look alike. Its neighbours can: on a surface their answers agree,
 
 A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
 ambient light and stripes of many strengths. Answers where there is no stripe count as wrong.
-docs/results/confidence.md says how far it can be believed.
+docs/results/confidence.md says how far a confidence can be believed.
 """
 
 from dataclasses import replace

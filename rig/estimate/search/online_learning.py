@@ -1,8 +1,8 @@
-"""Decides when an estimator learns, and holds the model that it uses until then.
+"""Decides when an estimator learns, and holds the model that it uses meanwhile.
 
-The first map is estimated with a model learned from that map itself. A later map is used for learning (a lesson) when
+The first map is estimated with a model learned from that map itself. A map is used for learning (a lesson) when
 enough frames have come since the last lesson (TEACH_FRAMES) and enough of its answers are confident (LEAST_SURE).
-Lessons run on a thread of their own. The new model is used a fixed number of frames later (LAG_FRAMES), so that a live
+Lessons run on a thread of their own. The new model is used for maps LAG_FRAMES frames or more later, so that a live
 scan hardly ever waits and results do not depend on the speed of the machine.
 """
 
@@ -33,7 +33,7 @@ TEACH_FRAMES = 100_000
 """Least number of lit frames from one lesson to the next: a second at 100 kHz. Learning costs some 0.2 s of one core,
 with the tables of `joint` twice that."""
 LAG_FRAMES = 50_000
-"""Lit frames from a lesson's map to the first map that is estimated with the new model: time to learn."""
+"""Least number of lit frames from a lesson's map to the first map estimated with the new model: time to learn."""
 
 Tables = TypeVar("Tables")
 """An estimator's tables for one model and one geometry."""
@@ -133,6 +133,7 @@ class OnlineLearner(Generic[Tables]):
         """Take note of a map: begin a lesson from it if one is due, or take over the model of the last lesson.
 
         used: the model that the map was estimated with; frames: its lit frames; see: called if the map is used.
+        Raises what a failed lesson raised.
         """
         self._frames_since += frames
         sure = bool(np.mean(stripes.confidence > 0.5) >= LEAST_SURE)

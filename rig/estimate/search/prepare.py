@@ -34,7 +34,7 @@ from rig.simd.vectors import LANES
 from rig.threads import RowWorkers
 
 BAND_ROWS = (64, 32, 16, 8, 4)
-"""Numbers of rows that may share a table: the largest for which the line shifts by at most BAND_SHEAR_PX is used."""
+"""Numbers of rows that may share a table: `rows_of_band` takes the largest for which the line hardly shifts."""
 BAND_SHEAR_PX = 1
 TAP_SHARE = 0.06
 """Least share of the line in a pixel that is read to score a position."""
@@ -134,7 +134,7 @@ def _hot_of_windows(hot: Bools, geometry: SweepGeometry) -> tuple[Int32, Int16, 
 
 
 def nothing_found(geometry: SweepGeometry, lines: tuple[Int32, Int32] | None) -> RowAnswers:
-    """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column."""
+    """Empty results of a sweep; lines: (rows, columns) whose counts are to be kept, sorted by column; None: none."""
     rows, columns = geometry.rows, geometry.columns
     lanes = -(-geometry.width // WORD_PX) * WORD_PX // STEPS + LANES
     stripe = np.full((columns, FIELDS, rows), np.nan, np.float32)
@@ -185,7 +185,7 @@ def _limits(geometry: SweepGeometry) -> Int16:
 
 
 def rows_of_band(geometry: SweepGeometry) -> int:
-    """The largest of BAND_ROWS for which windows shift by at most BAND_SHEAR_PX over the band, in 99 % of the cases."""
+    """The largest of BAND_ROWS over which 99 % of windows shift by at most BAND_SHEAR_PX; else the smallest."""
     inside = (geometry.x_lo <= geometry.x_hi) & (geometry.x_lo > 0) & (geometry.x_hi < geometry.width - 1)
     for rows in BAND_ROWS:
         first = np.arange(0, geometry.rows, rows)
@@ -208,7 +208,7 @@ def _lights(model: RowModel) -> tuple[Float32, Float32]:
 
 
 def _banded(sweep: Sweep, state: RowState, band_rows: int) -> tuple[Sweep, RowState]:
-    """Sweep and state with one row per band: geometry of the middle row, windows of all rows, mean ambient light."""
+    """Sweep and state with one row per band: rays of the middle row, union of windows, mean ambient light and gain."""
     rows = sweep.u.shape[0]
     first = np.arange(0, rows, band_rows)
     middle = np.minimum(first + band_rows // 2, rows - 1)
@@ -227,7 +227,7 @@ def _banded(sweep: Sweep, state: RowState, band_rows: int) -> tuple[Sweep, RowSt
 
 
 def _usual_mean(ambient: Float32) -> Float32:
-    """Mean over the rows (rows, width) of pixels that are not hot."""
+    """Mean (width,) of ambient light (rows, width) over the rows on which a pixel is not hot."""
     usual = ambient <= HOT_FACTOR * np.median(ambient, axis=0) + HOT_FLUX
     return np.asarray((np.where(usual, ambient, 0.0).sum(0) / usual.sum(0)).astype(np.float32))
 

@@ -2,8 +2,8 @@
 
 Every position is scored, the best one examined closely, and what can be learned from the row is recorded. BATCH rows of
 one column go together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`),
-with SCREENS amplitudes instead of all, one table for a band of rows and counts of 6 bits. The input is `SearchTables`,
-the output `RowAnswers`, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
+with SCREENS amplitudes instead of all, one table for a band of up to 64 rows and counts of 6 bits. The input is
+`SearchTables`, the output `RowAnswers`, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
 
 `judge_rows` serves both frames as they come and counts of whole sweeps (`rig.estimate.search.stream`).
 """
@@ -52,9 +52,9 @@ from rig.simd.shuffles import lanes_between, largest_of_rows, store_folded, tota
 from rig.simd.vectors import LANES, as_bytes, larger, larger_float, smaller, smaller_float, to_float32
 
 COUNT_LIMIT: Final = 63
-"""Largest count in the search; counts of more exposures are halved until they fit."""
+"""Most whole exposures in the search; counts of more are halved until they fit. Rounding may add 1 to a count."""
 EXPOSURE_PARTS: Final = 4
-"""Steps per exposure. Where counts are halved, exposures become fractions: 65 become 32.5, 65535 become 63.999."""
+"""Steps per exposure in tables. Where counts are halved, exposures are fractions: 65 become 32.5, 65535 63.999."""
 FIELDS: Final = 5
 """Fields of an answer: x_px, confidence, x_sd_px, signal and haze, see `StripeTable`. The confidence is the row's own,
 without its neighbours; a signal can be below zero."""
@@ -63,15 +63,16 @@ without its neighbours; a signal can be below zero."""
 class SearchTables(NamedTuple):
     """Inputs of the search in the rows of a sweep, which do not change during the sweep.
 
-    x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16 (columns, 2, rows + LANES), first and
-    last stored pixel of each search window, with the first after the last if there is none. rows: of the picture.
-    ambient: float32 (bands, width padded to whole words). hot_start: int32 (words, rows + 1): for a window that begins
-    at a word of WORD_PX pixels, index of the row's first entry in hot_at and hot_place; hot_at: int16, stored pixels
-    whose counts are not used; hot_place: int32, their places in the counts of all rows of the picture. nominal:
-    exposures for which the tables are made. faintest, brightest: photons of a stripe at scale 1. reach: px on either
-    side of a stripe whose light is its own. shift: scores have 128 >> shift units an octave; close_shift: the same for
-    the close-up. most: largest count. quiet_step: one of this number of columns is used to learn the ambient light.
-    flux: see `count_fluxes`.
+    band_rows: rows that share a table. x0: int32 (columns,), first stored pixel; window: stored pixels; limits: int16
+    (columns, 2, rows + LANES), first and last stored pixel of each search window, with the first after the last if
+    there is none. rows: of the picture. ambient: float32 (bands, end of the last window), photons per exposure.
+    hot_start: int32 (words, rows + 1): for a window that begins at a word of WORD_PX pixels, index of the row's first
+    entry in hot_at and hot_place; hot_at: int16, stored pixels whose counts are not used; hot_place: int32, their
+    places in the counts of all rows of the picture. nominal: exposures for which the tables are made. faintest,
+    brightest: photons of a stripe at scale 1. reach: px on either side of a stripe whose light is its own. shift:
+    scores have 128 >> shift units an octave; close_shift: the same for the close-up. most: whole exposures above
+    which counts are halved. quiet_step: one of this number of columns is used to learn the ambient light. flux: see
+    `count_fluxes`.
     """
 
     tables: ScreenTables
@@ -102,10 +103,10 @@ class RowAnswers(NamedTuple):
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
     of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane. light: int32, like
-    quiet, ones of every pixel within the windows. The most recent ones of both are still in quiet_here and light_here,
-    uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept; line_start:
-    int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
+    (rows, as many lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane. light:
+    int32, like quiet, ones of every pixel within the windows. The most recent ones of both are still in quiet_here and
+    light_here, uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept;
+    line_start: int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
     """
 
     stripe: Float32
@@ -122,9 +123,9 @@ class RowAnswers(NamedTuple):
 class SearchPointers(NamedTuple):
     """Pointers (`rig.simd.memory.pointers`) to tables, answers and a thread's memory, with the sizes of their arrays.
 
-    lanes: of the window. bands: tables per column. taps: pairs of pixels with taps, T + 1; weight_pairs: the same for
-    the close-up. sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that of the tables if they
-    have it (several_lines), else of the bands, ambient_px wide.
+    lanes: of the window. bands: tables per column. taps: pairs of pixels with taps, T + 1 (`ScreenTables`);
+    weight_pairs: pairs of the close-up. sum_lanes: of the sums over the picture. limit_rows: of `limits`. ambient: that
+    of the tables if they have it (several_lines), else of the bands, ambient_px wide.
     """
 
     judge: SearchTables
@@ -166,7 +167,7 @@ def count_fluxes() -> Float32:
 
 
 QUIET: Final = 0.9
-"""Probability within 1 px above which the pixels behind the stripe are used to learn the ambient light."""
+"""Probability of a stripe within 1 px above which the pixels behind it are used to learn the ambient light."""
 QUIET_STEP: Final = 8
 """If there are dark frames, one column in so many is used to learn the ambient light, else every column."""
 SIGNAL_REACH_PX: Final = 2
@@ -179,7 +180,7 @@ USUAL_PAIRS: Final = 4
 
 @numba.njit(cache=True, nogil=True)
 def halvings(exposures: int, most: int) -> int:
-    """Number of times that counts of this many exposures are halved, so that none exceeds `most`."""
+    """Number of times that counts of this many exposures are halved: the whole exposures are then at most `most`."""
     times = 0
     while (exposures >> times) > most:
         times += 1
@@ -188,9 +189,8 @@ def halvings(exposures: int, most: int) -> int:
 
 @numba.njit(forceinline=True)
 def _fetch_ahead(desk: SearchPointers, pixels: int, table: int) -> None:
-    """Prefetch table number `table`, the next column's. Few of its numbers are read in order, so the processor does not
-    prefetch them itself.
-    """
+    """Prefetch table number `table`, the next column's. The processor does not do it itself: few numbers are read in
+    order."""
     tables, taps = desk.judge.tables, 2 * SCREENS * desk.taps * pixels
     for at in range(0, taps, CACHE_LINE):
         prefetch(tables.tap + taps * table + at)
@@ -238,7 +238,7 @@ def table_for(desk: SearchPointers, search: Search, c: int, b: int, exposures: f
 
 @numba.njit(forceinline=True)
 def _hot_of_row(desk, x0, y):  # type: ignore[no-untyped-def]
-    """Index of row y's first hot pixel, and end of the row before, among the hot pixels of windows that begin at x0."""
+    """Index of row y's first hot pixel, where those of row y - 1 end, among those of windows that begin at x0."""
     return np.int64(read_int32(desk.judge.hot_start, (x0 // WORD_PX) * (desk.judge.rows + 1) + y))
 
 
@@ -276,7 +276,7 @@ def judge_rows(
 ) -> None:
     """Estimate rows first..first+rows-1 (at most BATCH) of column c, all in the band to which `table` belongs.
 
-    Their counts must be in `search.n`.
+    Their counts must be in `search.n`. Nothing is written if the table has no position to search.
     """
     if not table.searched:
         return
@@ -308,7 +308,7 @@ def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
     if rows == BATCH:
         store_float32(to, 0, lanes)
     else:
-        # The memory behind may be another thread's.
+        # The memory behind these rows may be another thread's.
         store_float32(search.answer, 0, lanes)
         for r in range(rows):
             write_float32(to, r, read_float32(search.answer, r))
@@ -316,7 +316,7 @@ def _answer(lanes, to, rows, search):  # type: ignore[no-untyped-def]
 
 @numba.njit(forceinline=True)
 def _measure_light(desk, search, table, first, rows, c, exposures, stripe):  # type: ignore[no-untyped-def]
-    """Measure signal and haze of the batch's rows, `first` and following ones, for the answers and the close-up."""
+    """Move the best positions into their rows' windows; measure signal and haze there for answers and close-up."""
     limits = desk.judge.limits + 4 * desk.limit_rows * c
     low, high = load_int16(limits, first), load_int16(limits, desk.limit_rows + first)
     store_int16(search.x, 0, smaller(larger(load_int16(search.x, 0), low), high))
@@ -396,7 +396,7 @@ def _compare_labels(desk, search, rows, exposures, pairs):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True)
 def _learn_quiet(desk: SearchPointers, lanes: int, n: int, y: int, c: int, x: int, exposures: float) -> None:
-    """Add the whole lanes behind the stripe at stored pixel x to the quiet counts."""
+    """Add the whole lanes behind row y's stripe, at stored pixel x, to the quiet counts; n: address of the counts."""
     judge = desk.judge
     limits = judge.limits + 4 * desk.limit_rows * c
     if read_int16(limits, y) > read_int16(limits, desk.limit_rows + y):

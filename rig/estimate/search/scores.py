@@ -1,14 +1,15 @@
 """Scores of all positions of a row, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-Computes log-likelihoods relative to 'everything is right of the stripe', the best of them and how probable its position
-is:
+Computes the log-likelihood of each position, with its prior, relative to 'everything is right of the stripe' (START);
+the best of these scores; and how probable its position is:
 
-    score_m(x) = K constant_m(x) + sum over pixels left of x of n edge + sum over pixels t around x of n_t tap_m,t(x)
+    score_m(x) = START + K constant_m(x) + prior_m(x) + sum of n edge left of x + sum over t around x of n_t tap_m,t(x)
 
-n: uint8, at most COUNT_LIMIT. Scores: saturating int16, in units of 1 / (128 >> shift) octaves of likelihood. Tables:
-`rig.estimate.search.tables`. A row of 128 pixels is eight vectors of counts in lane order (`rig.count.lane_order`):
-prefix sums run over the steps within a lane and then once over the lanes. For the probability of the best position
-scores become likelihoods (`rig.simd.functions`), which are summed over the row.
+n: uint8, at most COUNT_LIMIT + 1, in K exposures. Scores: saturating int16 with 128 >> shift units an octave (factor of
+2) of likelihood, shift as in `SearchTables`. Tables: `rig.estimate.search.tables`. A row of 128 pixels is four vectors
+of counts in lane order (`rig.count.lane_order`) and eight of scores: prefix sums run over the steps within a lane and
+then once over the lanes. For the probability of the best position scores become likelihoods (`rig.simd.functions`),
+which are summed over the row.
 """
 
 from typing import Final
@@ -216,7 +217,7 @@ def find_best(search: Search, rows: int, shift: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _lane_with(score: int, lanes: int, wanted: np.int16) -> int:
-    """The lowest lane that has that score."""
+    """The lowest lane that has the score `wanted`; 0 if none has."""
     for v in range(0, lanes, LANES):
         mask = np.uint32(0)
         for s in range(STEPS):

@@ -4,9 +4,9 @@ bit, as from the counts of the whole sweep.
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps its counts only
 on the rows that are needed to learn and to check the map. Rows are processed in chunks, so that counts never leave the
 cache. A chunk's counters, uint64 bit planes (`rig.count.kernels`), take the frames of a column as they come. At the
-first frame of the next column the rows of the finished one are read out of the planes into registers, judged, and
-dropped. If a column continues in the next block, its counters stay in memory. `search_volume` judges the counts of a
-whole sweep, integers (columns, rows, window).
+first frame of the next column the rows of the finished one are read out of the planes as bytes, judged, and dropped. If
+a column continues in the next block, its counters stay in memory. `search_volume` judges the counts of a whole sweep,
+integers (columns, rows, window).
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ from rig.simd.vectors import LANES, zero_bytes
 from rig.threads import RowWorkers
 
 SUM_LIMIT: Final = BYTE_FRAMES
-"""Most exposures in the 8-bit sums. With more they would overflow, so they are added up first (`carry_sums`)."""
+"""Most exposures in the 8-bit sums. Before these overflow, `carry_sums` adds them to the 32-bit ones."""
 
 
 class OpenColumn(NamedTuple):
@@ -88,7 +88,7 @@ def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> 
 
 @numba.njit(cache=True, nogil=True)
 def _carry(window: int, window_lanes: int, picture: int, lanes: int, lane: int, first_row: int, last_row: int) -> None:
-    """Add bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on, and clear them.
+    """Add bytes (rows, PAIRS, window_lanes, 2) to int32 (rows, PAIRS, lanes, 2) from `lane` on, and clear the bytes.
 
     window, picture: addresses of the bytes and of the int32."""
     for row in range(PAIRS * first_row, PAIRS * last_row):
@@ -239,7 +239,7 @@ class SearchedSweep(FrameTally):
 
     stripe: the stripe table. light: uint32 (rows, width), counts summed over the columns. quiet: float64 (2, rows,
     width), ones and exposures of pixels while clearly behind a stripe. lines: the counts used for learning. checked:
-    int32 (partners, points, window), counts of the `check_points` (`rig.count.map_checks`).
+    int32 (lines, points, window), counts of the `check_points` and their partners (`rig.count.map_checks`).
     """
 
     stripe: StripeTable
@@ -249,14 +249,14 @@ class SearchedSweep(FrameTally):
     checked: Int32
 
     def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32; they are known."""
+        """Counts summed over the columns, (rows, width) uint32. They are known, so `workers` has nothing to do."""
         return self.light
 
 
 class ColumnJudge:
-    """The `Counter` that also judges: it counts and estimates sweep after sweep, each with its own `SearchTables`.
+    """A `Counter` that also judges: it counts and estimates sweep after sweep, each with its own `SearchTables`.
 
-    Its memory is allocated once; `begin` clears it for the next sweep.
+    Its memory is allocated once; `begin`, in place of `reset`, clears it for the next sweep.
     """
 
     def __init__(self, layout: SweepLayout, geometry: SweepGeometry, judge: SearchTables, workers: RowWorkers) -> None:
@@ -272,7 +272,7 @@ class ColumnJudge:
         order = np.lexsort((rows, columns))
         self._found: RowAnswers = nothing_found(geometry, (rows[order], columns[order]))
         self._kept_at = np.argsort(order)
-        """Index among all kept lines: first of those of the lattice, then of those of the check points."""
+        """Index of each line among the kept ones, first of the lattice's lines, then of the check points'."""
         self._tally = SweepTally(layout)
         self._row_words = 0
         self._open: dict[int, OpenColumn] = {}
@@ -292,7 +292,7 @@ class ColumnJudge:
         self._open, self._row_words = {}, 0
 
     def add(self, bits: Uint8, bins: Int32, column: Float64, x0: Int32) -> None:
-        """Add frames as in `Counter`; columns that they complete are judged."""
+        """Add frames as in `Counter`; columns that they complete are judged. Raises ValueError if row bytes change."""
         first_word = x0 // np.int32(WORD_PX)
         self._tally.note(bins, column, first_word)
         words, row_words = bits.reshape(-1).view(np.uint64), bits.shape[2] // WORD_BYTES
@@ -359,7 +359,7 @@ class ColumnJudge:
         self._workers.post(chunks, work)
 
     def _desk(self, first: int) -> SearchPointers:
-        """Addresses for the thread that begins at chunk `first`; made with its first block."""
+        """Addresses for the thread that begins at chunk `first`; made with its first block under these tables."""
         if first not in self._benches:
             self._benches[first] = search_memory(padded_lanes(self._layout.window))
         if first not in self._desks:

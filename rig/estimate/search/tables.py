@@ -8,9 +8,10 @@ stripe lights it,
     tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes
     constant: the same of log(1 - p'), per exposure, since the number of frames differs from column to column
 
-If near is left, left is haze and ambient light and right is the pedestal; with the scanner on the other side it is the
-other way round. Haze and pedestal vary slowly from row to row, so the rows of a band share one table per column.
-Processors multiply and add 8-bit weights in one instruction. `ScreenTables` has the shapes.
+If near is left, the light on the left is haze and ambient light, on the right the pedestal (the level behind the
+stripe) and ambient light; with the scanner on the other side it is the other way round. Haze and pedestal vary slowly
+from row to row, so the rows of a band share one table per column. Processors multiply and add 8-bit weights in one
+instruction. `ScreenTables` has the shapes.
 """
 
 from typing import Final, NamedTuple
@@ -43,7 +44,7 @@ FLUX_LEFT, FLUX_RIGHT, GAIN_LEFT, GAIN_RIGHT, LOSS_LEFT, LOSS_RIGHT = range(6)
 class ScreenTables(NamedTuple):
     """Tables of all columns and bands, see the module.
 
-    P: stored pixels per row, padded to whole vectors. Unless stated otherwise they are in lane order, in STEPS steps,
+    P: stored pixels per row, padded to whole vectors. Unless stated otherwise pixels are in lane order, in STEPS steps,
     which make PAIRS pairs (`rig.count.lane_order`). T: pixels to each side of a position that are looked at.
 
     edge: int8 (columns, bands, PAIRS, lanes, 2), weight of a count left of the stripe.
@@ -54,14 +55,14 @@ class ScreenTables(NamedTuple):
     included; slope: int16, the same shape, what each further exposure adds to it, in 1 / SLOPE of a unit.
     lane: float32 (columns, bands, lanes), score in units per exposure if all pixels up to the lane's last one lie left
     of the stripe.
-    none: float32 (columns, bands, NONE), scores of 'no stripe': all pixels right of it, all left of it, a change
-    somewhere (per lane); then the first and last lane with pixels of the column.
+    none: float32 (columns, bands, NONE), log priors, in units, of 'no stripe': all pixels right of the stripe, all left
+    of it, a change in a given lane; then the first and last lane with pixels of the column.
     neutral: float32 (columns, bands, P), ones per exposure that are as likely left of the stripe as right of it, in
     pixel order.
     before, scale: float32 (columns, bands, P) as in `RowBuffers`, in pixel order.
-    first, last: int32 (columns, bands), first and last position in stored pixels.
+    first, last: int32 (columns, bands), first and last position in stored pixels; first > last if there is none.
     ambient: float32 (columns, bands, P), ambient light and other lines' haze, in pixel order; of shape (0, bands, P) if
-    there are no other lines.
+    other lines have hardly any.
     """
 
     edge: NDArray[np.int8]
@@ -249,11 +250,11 @@ class Search(NamedTuple):
 
     n: counts, see `rig.count.lane_order`. int16: score (STEPS, lanes); start (lanes,), score of a change at the lane's
     first pixel; tops (LANES,), item i: the largest score of lanes i, i + LANES, ...; constant (SCREENS, STEPS, lanes),
-    the tables' part per exposure times the exposures; lane (lanes,), the same for lanes; change (lanes,), score added
+    that of each position for the column's exposures; lane (lanes,), the same for lanes; change (lanes,), score added
     by a change without a stripe in the lane; label (LANES,), scores of the close-up; place: index in a row of counts of
     each pixel from -PLACE_BEFORE on. neutral, muted: bytes, counts of hot pixels, see `rig.estimate.search.rows`. For
     each row of the batch, int16: all_left, sum of all lanes; best, x: best score and its pixel; left, right: the scores
-    beside it; levels: of the close-up; lift: see `lift_to_powers`; ceiling: largest score of 'no stripe'. float32:
+    beside it; levels: of the close-up; lift: see `lift_to_powers`; ceiling: limit of scores of 'no stripe'. float32:
     light, before, scale, ambient: see `rig.estimate.search.rows`; answer: one field of the answers before it is
     written. Folded (`rig.simd.shuffles`): mass, sum of all likelihoods; moment, square: sums of the close-up.
     """

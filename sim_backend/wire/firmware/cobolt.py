@@ -94,8 +94,8 @@ class CoboltModel:
 
     on_emission(emits, now_s) is called whenever power or emission change. refuses: commands and questions that this
     unit does not know; None: those of its family. shutter: whether it knows `l0r` and `l1r`, which pause and resume;
-    None: as its family. key_cycle: whether `@cob1` always waits until the key is turned off and on, even where nothing
-    was said before. deaf_s: time after the start of the warm-up for which it answers OK to a power, and forgets it.
+    None: as its family. key_cycle: whether `@cob1` waits in any state until the key is turned off and on again.
+    deaf_s: time from the start of the warm-up for which it answers OK to a command for a power, but does not obey.
     """
 
     family: Family = "06-MLD"

@@ -145,8 +145,8 @@ class EtherDreamModel:
 
     def advance(self, now_s: float) -> None:
         """Play on until now. Each period of the timer shows the point that was read out before it, and reads out the
-        next one, whose rate change comes into force with the period that shows it. If there is none, all outputs go
-        to 0 V at once, and the point read out last is never shown.
+        next one, whose rate change comes into force with the period that shows it. If there is no next one, all outputs
+        go to 0 V at once, and the point read out last is never shown.
         """
         while self.playback == PLAYING and self._next_s <= now_s:
             if not len(self._ring):
@@ -173,8 +173,8 @@ class EtherDreamModel:
             self.causes = self.causes & ~INPUT_NOW | BY_INPUT
 
     def link(self, up: bool, now_s: float) -> None:
-        """Pull the network's cable, which is an emergency stop, or plug it in, which ends this one without a c. The
-        connection survives.
+        """Pull the network's cable, which is an emergency stop, or plug it in, which ends this stop without the command
+        c. The connection survives.
         """
         self.advance(now_s)
         if up:

@@ -170,7 +170,7 @@ class IbeamModel:
         return self._take_unasked().encode("ascii")
 
     def _level_w(self, without: int = 0) -> float:
-        """Sum of the levels of the enabled channels but one, 0 while the driver is off."""
+        """Sum of the levels of the channels that shine, without one of them. 0 while the driver is off."""
         if not (self.state_on and self.able and self._now_s >= self._lit_at_s):
             return 0.0
         shining = (self.enabled | set(self.powers_w if self.disabled_shine else ())) - {without}

@@ -132,7 +132,7 @@ class NidaqModel(Card):
         return self.tasks[fields.task]
 
     def _report(self, task: Task) -> None:
-        """Raise the error that ended the generation. It is raised until the task is stopped."""
+        """Raise the error that ended the generation, if any. It is forgotten once it is raised for a stopped task."""
         error = task.error
         if task.state != ni.RUNNING:
             task.error = None
@@ -309,7 +309,7 @@ class NidaqModel(Card):
         return task, fields.write_array
 
     def _write(self, call: Call, task: Task, rows: NDArray[Any], fields: Any, now_s: float) -> Answer | None:
-        """Take samples, (outputs, n): at once, or as there is room for them."""
+        """Take samples, (outputs, n): at once, or as there is room for them. None: not all are taken yet."""
         before, n = task.state, rows.shape[1]
         if not task.buffered:
             if not fields.auto_start and before != ni.RUNNING:

@@ -65,8 +65,8 @@ class ObisModel:
     on_emission(emits, now_s) is called whenever power or emission change. channel: the laser's slot, if it is on a
     Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits 0x1080
     set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched on, as
-    the manual's table has it. emission_bit_lag_s: time for which the status still says
-    'emission' when the light is off.
+    the manual's table has it. emission_bit_lag_s: time for which the status still says 'emission' after the laser was
+    switched off.
     """
 
     handshake: bool = True
@@ -144,7 +144,7 @@ class ObisModel:
         self._tell()
 
     def turn_key(self, on: bool, now_s: float) -> None:
-        """Turn the key of the Remote: off darkens the laser, and on switches it on, as the names of the words say."""
+        """Turn the key of the Remote: off darkens the laser; on switches it on, unless something forbids it."""
         self.tick(now_s)
         self.key_on = on
         self._switch(on and self.able)

@@ -56,9 +56,10 @@ class PrawnDoModel(OutputLevels):
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
     trigger: the signal on GPIO16; None: always low. board: 1 for a Pico, 2 for a Pico 2. version: what `ver` answers.
-    Before 1.3.1, `swr` waits for the trigger, and after an abort `man` sets what the one before it asked for; before
-    1.3.0, there is no `brd`. external_clock_hz: frequency of the clock on GPIO20; None: there is none. uart_takes_pins:
-    whether the loss of that clock takes outputs 0 and 1 away until power-up, as in a build with the SDK's defaults.
+    Before 1.3.1, `swr` waits for the trigger, and after an abort `man` lags by one: the first sets the program's next
+    word, each later one the levels of the `man` before. Before 1.3.0, there is no `brd`. external_clock_hz: frequency
+    of the clock on GPIO20; None: there is none. uart_takes_pins: whether the loss of that clock takes outputs 0 and 1
+    away until power-up, as in a build with the SDK's defaults.
     """
 
     def __init__(
@@ -396,9 +397,8 @@ class PrawnDoModel(OutputLevels):
         return _said(f"{outputs:x} {cycles:x}")
 
     def _type(self, line: str) -> bool:
-        """Read two numbers of a line of `add` or `edt`; returns whether the firmware takes the line for a word. It
-        takes an empty one, with the numbers of the line before it.
-        """
+        """Read two numbers of a line of `add` or `edt`; returns whether the firmware takes the line for a word. It does
+        so for an empty line, with the numbers of the line before."""
         numbers = _scanned(line, _HEX_NUMBER, 2)
         self._typed[: len(numbers)] = numbers
         return len(numbers) == 2 or not line.strip(_SPACE)

@@ -75,7 +75,7 @@ class RpcError(Exception):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Program:
-    """An uploaded sequence. starts_ns, levels: (n,), from when on within a run which digital levels are output."""
+    """An uploaded sequence. starts_ns, levels: (n,), times within a run at which steps begin, and their levels."""
 
     steps: list[tuple[int, int, int, int]]
     """(duration in ns, digital levels, analog 0, analog 1) as uploaded."""
@@ -120,8 +120,8 @@ class _Span:
 class PulseStreamerModel:
     """The device and its outputs. Times are seconds of whatever clock the wire runs on; they never decrease.
 
-    trigger, low: the first time in [from, until) at which the trigger line is high, or low, or None; without either it
-    is always low. version: that of the firmware. rearm_s: time from the end of a sequence until a trigger counts again.
+    trigger, low: functions that tell when the trigger line is high, and when it is low; by default it is always low.
+    version: that of the firmware. rearm_s: time from the end of a sequence until a trigger counts again.
     keeps_sequence: whether a trigger starts the sequence again even after `constant` or `forceFinal`.
     """
 
@@ -297,7 +297,7 @@ class PulseStreamerModel:
         self._seen_s, self._was_high = at_s, None
 
     def _edge(self, until_s: float) -> float | None:
-        """The next edge before `until_s` that is a trigger. The line is not looked at before it has come so far."""
+        """The next edge before `until_s` that is a trigger, or None. The line is looked at from `_seen_s` on."""
         wanted = {RISING: (True,), FALLING: (False,), BOTH: (True, False)}.get(self.trigger_start, ())
         while wanted and self._seen_s < until_s:
             if self._was_high is None:
@@ -338,7 +338,7 @@ class PulseStreamerModel:
         return 0
 
     def _load(self, packed: bytes, order: str, n_runs: Any, final: int) -> None:
-        """Take a sequence into the memory, instead of any other one, and play it if it has not to wait."""
+        """Take a sequence into the memory, in place of any other, and play it if it need not wait for a start."""
         if not 0 < len(packed) <= MAX_STEPS * STEP_BYTES or len(packed) % STEP_BYTES:
             raise RpcError(INVALID_PARAMS, f"INVALID_PARAMS: stream: {len(packed)} bytes are no sequence")
         if type(n_runs) is not int or n_runs == 0:
@@ -362,7 +362,7 @@ class PulseStreamerModel:
         return self._drop()
 
     def _drop(self) -> int:
-        """Forget the sequence, if such calls do that."""
+        """Forget the sequence, unless `keeps_sequence`."""
         if not self._keeps_sequence:
             self.program, self.armed = None, False
         return 0

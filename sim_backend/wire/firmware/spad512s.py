@@ -2,7 +2,7 @@
 
 A pure state machine: it gets commands and the time, and gives text and pixels. It takes frames of 1 bit and of the full
 width only. Their content comes upright from `frames` and is turned onto its side, as the real sensor delivers it.
-Public sources tell what clients send and how they read the answers, so the words of most answers are made up here.
+Public sources tell what clients send and how they read the answers, but most answers' exact words are made up here.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from drivers.spads.orientation import QuarterTurn, turn_packed
 
 FrameSource = Callable[[int, float, float, int], NDArray[np.uint8]]
-"""(first frame, start of its exposure in s of the clock, period in s, n) -> upright frames, uint8 (n, height, bytes).
-"""
+"""(first frame, start of its exposure in s, period in s, n) -> upright frames, uint8 (n, height, row bytes)."""
 
 BANNER: Final = "SPAD512S TCP server\n"
 CALIBRATION_SOON: Final = "The breakdown calibration process will start soon.\n"
@@ -47,10 +46,11 @@ class Spad512sProgram:
     starts; 0: none.
 
     glued_done: whether text answers end with DONE, as in one emulation; the real program's behaviour is unknown.
-    extra_fields: whether `R` answers eight fields instead of six. flavour: 512, or 1M for 1024 rows. columns: pixels of
-    a row as the sensor delivers it; None: as many as there are rows. labels: whether the lines of `D` tell what they
-    mean. fields: numbers of fields with which `I` is taken; newer clients of the vendor send nine. heeds_stop: whether
-    STOP ends a run. wants_pile_up: whether each run needs PU,0 before it.
+    extra_fields: whether `R` answers eight fields instead of six. flavour: 512, or 1M for 1024 rows. intensity: whether
+    `D` says that there is intensity imaging. columns: pixels of a row as the sensor delivers it; None: as many as there
+    are rows. labels: whether the lines of `D` tell what they mean. fields: numbers of fields with which `I` is taken;
+    newer clients of the vendor send nine. heeds_stop: whether STOP ends a run. wants_pile_up: whether each run needs
+    PU,0 before it.
     """
 
     calibration_s: float = 0.0

@@ -153,7 +153,7 @@ class EmulatedRun:
         return self._block(0, BlockFlag.LAST | flag, status)
 
     def next_block(self, now_s: float) -> memoryview | None:
-        """The next block, if one is ready at that time."""
+        """The next block: frames, a heartbeat after `IDLE_S` without any, or the run's end. None: nothing is due."""
         if self._n_frames is not None and self.next_frame >= self._n_frames:
             return self.end(BlockStatus.OK, BlockFlag(0))  # stopped just after a whole block
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - self.next_frame)

@@ -23,7 +23,7 @@ MOST = 2**32 - 1
 """Largest number that a line can have."""
 GATE: Final = 2
 HELD: Final = 8
-"""Bit of a word, beside its outputs."""
+"""Bit of a word, beside those of its outputs: the word is held, as in `drivers.interfaces.Pulse`."""
 NO_PROGRAM: Final = "error no program: new, add, end"
 POLL_S: Final = 20e-6
 """Step at which the marker's fall is looked for if nobody tells its time: a point of a fast scanner."""
@@ -172,7 +172,7 @@ class TeensyModel(OutputLevels):
         while at_s < until_s and (low_s := self._marker_low(at_s, until_s)) is not None:
             was_low = True
             due_s = low_s + self.hold_s if low_s > self._start_s else self._start_s
-            # From a tick later on, so that there is an end even if both say that it is so in the same instant.
+            # From a tick later on, so that there is an end even if the marker is said to fall and rise in one instant.
             high_s = self._trigger(low_s + TICK_S, min(due_s, until_s)) if due_s > low_s + TICK_S else None
             if high_s is None:
                 if due_s <= until_s and due_s < end_s:
@@ -264,7 +264,7 @@ class TeensyModel(OutputLevels):
                 return "error unknown command"
 
     def _load(self, name: str, arguments: list[str], text: str) -> str:
-        """Answer a line of a program. It is left empty unless the line turns out right."""
+        """Answer a line of a program. The program is dropped unless the line turns out right."""
         was, self.load = self.load, "empty"
         if name == "new":
             repeats, hold = [_decimal(word) for word in arguments] if len(arguments) == 2 else (None, None)

@@ -23,7 +23,7 @@ WORKERS = 8
 _POLL_S = 0.001
 """Time, of the model's clock, after which a call that waits is tried again."""
 _TURN_S = 0.05
-"""Time between two looks at the model while nobody calls, and at the end of a hang."""
+"""Time between two turns of the serving thread, and between two looks whether a hang is over."""
 _OPTIONS = (("grpc.max_receive_message_length", -1), ("grpc.max_send_message_length", -1), ("grpc.so_reuseport", 0))
 """Messages of any length, as NI's server takes them by default, and a port of one's own."""
 
@@ -45,9 +45,8 @@ class GrpcModel(Protocol):
 
 
 class GrpcServer(WireServer[GrpcModel]):
-    """A server for any number of clients. Unplugged, it is out of reach; tasks run on, as a network cable is no power.
-
-    Raises DeviceError if the packages are not installed.
+    """A server for any number of clients. Unplugging puts it out of reach, but tasks run on, since the card keeps its
+    power. Raises DeviceError if the packages are not installed.
     """
 
     def __init__(self, model: GrpcModel, *, clock: Clock | None = None) -> None:
@@ -77,7 +76,7 @@ class GrpcServer(WireServer[GrpcModel]):
         self._server.start()
 
     def unplug(self) -> None:
-        """Listen no more. Calls under way fail, and so do new ones."""
+        """Stop listening. Calls under way fail, and so do new ones."""
         server, workers = self._server, self._workers
         if server is None or workers is None:
             return
@@ -147,7 +146,7 @@ def _fields(message: Any) -> Mapping[str, Any]:
 
 
 def _packages() -> tuple[Any, Any]:
-    """The modules of grpc and of the messages."""
+    """The modules of grpc and of the messages. Raises DeviceError if one is not installed."""
     try:
         import grpc
         from nidaqmx._stubs import nidaqmx_pb2

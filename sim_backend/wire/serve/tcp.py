@@ -147,7 +147,7 @@ class TcpServer(WireServer[TcpModel]):
             return len(data)
 
     def _drop_client(self, *, reset: bool = True) -> None:
-        """End the connection. reset: as the end of a program with unread input does; else what was sent arrives."""
+        """End the connection. reset: whether to reset it, as when a program ends; else what was sent still arrives."""
         if self._client is None:
             return
         if reset:

@@ -75,7 +75,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
             self._devices.append(device)
             return device
 
-    # Called by pyusb. Names and arguments are pyusb's; a transfer returns the bytes that passed, fewer on a time-out.
+    # Called by pyusb, with its names and arguments. Transfers return the number of bytes that passed in time.
 
     def enumerate_devices(self) -> Iterator[AttachedDevice]:
         """The devices on the bus."""
@@ -89,7 +89,7 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         return _named(_DEVICE_FIELDS, DEVICE_FORM, descriptor, **place, speed=_SPEED[dev.spec.speed])
 
     def get_configuration_descriptor(self, dev: AttachedDevice, config: int) -> SimpleNamespace:
-        """The only configuration."""
+        """The descriptor of the only configuration, which has index 0; IndexError for any other index."""
         if config != 0:
             raise IndexError(f"no configuration index {config}")
         descriptor = dev.spec.configuration_descriptor()
@@ -203,7 +203,7 @@ def _alternate(dev: AttachedDevice, interface: int, index: int) -> AlternateSpec
 
 
 def _named(fields: str, form: str, descriptor: bytes, **more: object) -> SimpleNamespace:
-    """A descriptor as pyusb takes it: an object with an attribute a field."""
+    """A descriptor as pyusb takes it: an object with one attribute for each field."""
     return SimpleNamespace(**dict(zip(fields.split(), struct.unpack_from(form, descriptor), strict=True)), **more)
 
 

@@ -186,8 +186,8 @@ class UsbModel:
 class AttachedDevice:
     """A model on the bus. Enforces the rules of a kernel and a host controller. Thread-safe.
 
-    All errors are `UsbFailure`. Any call may raise ENODEV (the device is unplugged), any transfer EPIPE (it is refused,
-    or its endpoint is halted).
+    All errors are `UsbFailure`, named here by their errno. Any call but `close` may raise ENODEV (the device is
+    unplugged), any transfer EPIPE (refused, or its endpoint is halted), `out` and `inp` also ENOENT (not claimed).
     """
 
     def __init__(self, model: UsbModel, bus: int, port: int, now: Callable[[], float]) -> None:
@@ -208,7 +208,7 @@ class AttachedDevice:
         self._halted: set[int] = set()
 
     def unplug(self) -> None:
-        """Pull the cable: every call fails with ENODEV from now on."""
+        """Pull the cable: every call but `close` fails with ENODEV from now on."""
         with self.lock:
             if self.present:
                 self.present = False

@@ -1,4 +1,4 @@
-"""The base of emulated wires to a model: a cable that can be pulled, and firmware that can hang."""
+"""The base of emulated wires to a device model: a cable that can be pulled, and firmware that can hang."""
 
 import threading
 import time
@@ -69,7 +69,7 @@ class WireServer(ABC, Generic[Model]):
         """Pull the cable. The open port is lost, and so are bytes on their way."""
 
     def hang(self) -> None:
-        """Let the firmware hang: it takes and sends nothing, and outputs stay as they are."""
+        """Let the firmware hang: it takes and sends nothing. What its outputs are doing goes on."""
         with self.lock:
             self._hung = True
             self._outbox.clear()

@@ -18,7 +18,7 @@ from drivers.registry import Surroundings
 from drivers.replay.spad import KIND, ReplaySpad, ReplaySpadConfig
 from drivers.replay.stand_ins import SCANNER, StandInConfig
 from drivers.ring import BlockRing, OnFull
-from drivers.spb1 import BlockLayout, block_parts, block_views, seal_block
+from drivers.spb1 import HEADER_BYTES, BlockLayout, block_parts, block_views, seal_block
 from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
 from tests.wire.spads import finish
 
@@ -204,8 +204,14 @@ def test_a_step_ends_with_the_next_scan_marker(recording: Path) -> None:
         assert ends == [5, 29, 40, 75]  # 29: the gap
 
 
-def test_real_time_is_that_of_the_recording(recording: Path) -> None:
+@pytest.mark.parametrize("damaged", [False, True])
+def test_real_time_is_that_of_the_recording_also_if_its_first_block_is_lost(recording: Path, damaged: bool) -> None:
     clock = VirtualClock()
+    if damaged:
+        file = recording / "frames-000000.spb"
+        data = bytearray(file.read_bytes())
+        data[HEADER_BYTES] ^= 1
+        file.write_bytes(data)
     with KIND.create(ReplaySpadConfig(recording=recording, clock="x0.01"), Surroundings(clock, None, 0)) as device:
         played(device)
         assert clock.now_ns() / 1e9 == pytest.approx(100 * 1e-5 / 0.01)

@@ -12,8 +12,7 @@ As in `rig.estimate.joint.labels.costs`,
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
 
 Of the learned model these costs need only the line's width and the hot pixels. Where fog scatters light many times, a
-learned haze and halo can explain a wrong position, but cannot mislead these costs. On the other hand, these costs do
-not use the end of haze as evidence.
+learned haze and halo can explain a wrong position, but cannot mislead these costs. They ignore where the haze ends.
 """
 
 from typing import Final, NamedTuple
@@ -35,7 +34,7 @@ from rig.simd.vectors import LANES, as_bytes, larger_float, smaller_float, to_in
 ROWS: Final = 6
 """Rows to either side whose pixels also belong to a label's surroundings."""
 BESIDE_PX: Final = 4, 10
-"""Pixels to either side of a label that are its surroundings, from and to."""
+"""Distances, in px, of the nearest and the farthest pixel on either side that belong to a label's surroundings."""
 REACH_PX: Final = 2
 """Pixels to either side of a label that its line falls on."""
 LEAST_ONES: Final = np.float32(0.5)
@@ -53,7 +52,7 @@ class Contrast(NamedTuple):
     count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
     which is -4/8 to 3/8 px off the middle of its pixel, towards near. First index: 0 from far to near, 1 from near to
     far. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width: pixels of a sensor's
-    row; what is stored behind them is padding.
+    row; what is stored behind them is padding. units_per_nat: of cost.
     """
 
     place: Int16
@@ -80,7 +79,7 @@ def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
 def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, *, alone: bool) -> None:
     """Replace the costs of rows first..last-1 by these costs or, if not alone, by the mean of both.
 
-    cost: uint8 (rows, columns, labels) of all rows. Labels that are EXCLUDED stay so, and so do columns without frames.
+    cost: uint8 (rows, columns, labels) of all rows. EXCLUDED labels and columns without frames keep their costs.
     Threads may fill different rows at once.
     """
     _fill(volume.counts, volume.n_frames, volume.x0, contrast, first, last, alone, cost)
@@ -168,7 +167,7 @@ def _note_pixels_beside(seen: int, pixels: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _add_up(total: Float32, running: Float32) -> None:
-    """Fill `running`: item BESIDE_PX[1] + t + 1 is the sum of total up to pixel t, or of all beyond the last pixel.
+    """Fill `running`: item BESIDE_PX[1] + t + 1 is the sum of items 0 to t of total, or of all if t is beyond the last.
 
     float32 is exact for sums below 2^24.
     """
@@ -186,7 +185,7 @@ def _score_pixels(
 ) -> None:  # fmt: skip
     """Fill `score` for pixels low..high-1 from item LANES + low on, and set the LANES items behind them to 0.
 
-    n: counts from REACH_PX before the window on. seen: frames times rows around. pooled: N of the module.
+    n: counts from REACH_PX before the window on. seen: frames x rows of the surroundings. pooled: N of the module.
     """
     at, sums, one_over, to = address_of(n), address_of(running), address_of(pixels), address_of(score)
     (begin, end), one, none = BESIDE_PX, np.float32(1.0), zero_float32()

@@ -4,14 +4,14 @@ Counts are read, edges summed, positions scored and costs written in saturating 
 Relative to 'everything is before the stripe', with weights and constants of `rig.estimate.joint.labels.tables` in
 units,
 
-    sums(p)  = sum over pixels p' < p of (n edge + constant edge)        evidence of all pixels behind
+    sums(p)  = sum over pixels p' < p of (n edge + edge's constant)      all farther pixels lie behind the stripe
     score(x) = sums + max over brightnesses of (constant + sum over taps n tap)
     cost(x)  = (best score of the row - score(x)) / 2^down               uint8, at most COST_LIMIT
 
-Counts n are int16 fractions of their maximum (COUNT_BITS). The costs of a pixel's two phases are the low and the high
-byte of the same 16 bits, in this order. BATCH rows of a column go through each part together. Parts are separate
+Counts n are int16 fractions of their maximum (COUNT_BITS). The costs of a pixel's two labels (phases 0 and 1) are the
+low and the high byte of the same 16 bits. BATCH rows of a column go through each part together. Parts are separate
 functions and not inlined, because in a single function the compiler keeps a register for every address. The loop over
-taps is unrolled for the usual width of the line.
+taps (the pixels around a label) is unrolled for the usual width of the line.
 """
 
 from typing import Final, NamedTuple
@@ -80,7 +80,7 @@ from rig.simd.vectors import (
 COST_LIMIT: Final = 160
 """Largest cost of a label that is not excluded."""
 EXCLUDED: Final = 255
-"""Cost of an impossible label: outside the picture, or more than a pixel outside the row's search window."""
+"""Cost of an impossible label: outside the stored pixels, or more than a pixel outside the row's search window."""
 BASE: Final = -8000
 """Score of 'everything is before the stripe': low, since most scores lie above it."""
 _USUAL_TAPS: Final = 5
@@ -96,8 +96,8 @@ def read_bytes(
 ) -> None:  # fmt: skip
     """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any values.
 
-    counts: address of the first count, begin: index of the first row's first count. stored: first pixel, pixels of a
-    row, number of all counts, counts of a column. times: factor on counts.
+    counts: address of the first count; begin: index of the first row's first count. stored: x of a row's first stored
+    pixel, stored pixels of a row, number of all counts, counts of a column. times: factor on counts.
     """
     x0, window, size, column = stored
     factor = np.int16(times)
@@ -113,7 +113,7 @@ def read_bytes(
                 count = np.int64(read_byte(counts + begin + r * window, x)) if 0 <= x < window else np.int64(0)
                 write_int16(n, p, np.int16(count * times))
             continue
-        # Prefetch the next column's counts, which come after this column's last row, as far as the next row does not.
+        # Prefetch this row's counts in the next column, no more than a window's: the next row prefetches the rest.
         for line in range(0, min(pixels + LANES, window), CACHE_LINE):
             prefetch(counts + low + column + line)
         if side > 0:
@@ -128,7 +128,7 @@ def read_bytes(
 def mend_rows(at: LabelTables, places: int, y: int, per_nat: float, side: int, b: Buffers, batch: int) -> None:
     """Give a count without information to pixels with a weight in the table that are hot or missing in the row.
 
-    y: index of the first row; per_nat: units times exposures.
+    y: index of the first row; per_nat: units that a nat per exposure is worth.
     """
     for r in range(batch):
         i, place = read_int32(b.here, r), places + 2 * PLACES * r
@@ -254,7 +254,7 @@ def cost_rows(at: LabelTables, ways: Ways, b: Buffers, batch: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_bytes: int) -> None:
-    """Write the costs of labels to address `out`, `row_bytes` from row to row."""
+    """Write the costs of labels, EXCLUDED for impossible ones, to address `out`, `row_bytes` from row to row."""
     for r in range(batch):
         here, cost, to = places + 2 * PLACES * r, b.cost + r * b.cost_row, out + r * row_bytes
         low, high = read_int16(here, LABEL), read_int16(here, LABEL_END)
@@ -274,8 +274,8 @@ def write_rows(places: int, ways: Ways, b: Buffers, batch: int, out: int, row_by
 class CostRoom(NamedTuple):
     """Tables and buffers of `fill_costs` and `fit_tables`, which take `pointers` to them.
 
-    read: number of pixels of a row that are read. Those beyond the last label of all tables and its taps have a weight
-    only with a halo.
+    read: number of pixels of a row that are read. Without a halo, pixels beyond the last label of all tables and its
+    taps do not matter.
     """
 
     at: LabelTables
@@ -365,9 +365,9 @@ def fill_costs(
 def _times(exposures: int, ways: Ways) -> float:
     """Factor on the counts of a column, a whole number if it is not below 1; products fit 16 bits.
 
-    A nat is worth as many units as in a map whose columns all have this number of exposures, so fewer with more of
-    them. Otherwise a column with few exposures would count for less beside others with many, and the penalties between
-    neighbours for more.
+    A nat is worth as many units as in a map whose columns all have this number of exposures: the more exposures, the
+    fewer units. Otherwise, beside columns with many exposures, one with few would count for less, and the penalties
+    between neighbours for more.
     """
     full = 2.0 ** (COUNT_BITS - ways.bits)
     worth = (ways.sharp + ways.exposures) / (ways.sharp + exposures)
@@ -400,7 +400,7 @@ def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def _fit_table(at: LabelTables, i: int, j: int, per_nat: float, to: Fitted, through: int) -> None:
-    """Write table i's constants and edges for a number of exposures to index j; per_nat: units times exposures."""
+    """Write table i's constants and edges for a number of exposures to index j. per_nat: of `mend_rows`."""
     source, constant = at.constant + 4 * i * at.constants, to.constant + 2 * j * at.constants
     for k in range(0, at.constants, LANES):
         store_int16(constant, k, rounded(load_float32(source, k) * np.float32(per_nat)))
@@ -418,7 +418,7 @@ def _read_any(
     counts: Counts, c: int, y: int, places: int, x0: int, side: int, pixels: int,
     times: float, b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """Fill n as `read_bytes` does, from counts of any size."""
+    """Fill n as `read_bytes` does, from counts of any type and with any factor; 0 where nothing was stored."""
     for r in range(batch):
         start = read_int16(places, PLACES * r + START) - x0
         for p in range(pixels):

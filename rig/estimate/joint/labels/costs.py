@@ -78,7 +78,7 @@ HALO_TRUST: Final = 0.9
 class Costs:
     """Tables and settings for the costs of sweeps under one model; made once per model by `costs_of`.
 
-    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less if 16 bits do not hold the scores of haze.
+    units_per_nat: of cost; UNITS / (1 + exposures / SHARP), or less if 16 bits would not hold the scores.
     """
 
     grid: LabelGrid
@@ -95,8 +95,8 @@ class Costs:
     def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        Rows of columns without frames, and rows with nothing to search, cost 0. Call it best with 16 rows or more at a
-        time. Threads may fill different rows at once, each with its own working memory. room: `pointers` to this
+        All labels cost 0 in columns without frames and where nothing is searched. Call it best with 16 rows or more at
+        a time. Threads may fill different rows at once, each with its own working memory. room: `pointers` to this
         memory, which the caller keeps alive.
         """
         fill_costs(
@@ -205,7 +205,7 @@ def _empty_tables(at: Int32, tables: int, grid: LabelGrid, taps: int, hot: Bools
 
 
 def _lights(model: RowModel) -> Float32:
-    """Quantiles of the learned amplitudes."""
+    """QUANTILES of the learned amplitudes, or HALO_QUANTILES under a halo; ascending."""
     weight = np.maximum(model.weight, 1e-6)
     middle = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
     quantiles = HALO_QUANTILES if model.halo.any() else QUANTILES
@@ -213,8 +213,8 @@ def _lights(model: RowModel) -> Float32:
 
 
 def hot_in_bands(ambient: Float32) -> Bools:
-    """Pixels (rows, width) far brighter than the median at their x over their band (in the last band, over the last
-    BAND_ROWS rows)."""
+    """Pixels (rows, width) with ambient light far above the median at their x over their band; for the last band, over
+    the last BAND_ROWS rows."""
     rows, hot = len(ambient), np.empty(ambient.shape, np.bool_)
     for first in range(0, rows, BAND_ROWS):
         band = ambient[first : first + BAND_ROWS]

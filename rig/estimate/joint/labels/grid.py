@@ -6,11 +6,11 @@ column is at
 
     x = x_far - side l / PER_PX,     x_far: float64 (rows, columns), side: 1 where near is left, else -1
 
-A table, made once per geometry, says where labels lie in the pixels of each row (`places_of`, int16 (columns, rows,
-PLACES)). Pixels are numbered from far to near: pixel p of a row is at x = START - side p, and FAR_PX pixels come before
-the one that contains label 0, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel
-holds two labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half). Their exact position in the pixel
-is the variant, in eighths of a pixel: 0 to 3.
+A table says where labels lie in the pixels of each row (`places_of`, int16 (columns, rows, PLACES)). Pixels are
+numbered from far to near: pixel p of a row is at x = START - side p, and FAR_PX pixels come before the one that
+contains label 0, so that neighbouring rows of a leaning line have the same depth at the same p. A pixel holds two
+labels, half a pixel apart, of phase 0 (its far half) and 1 (its near half). The variant, 0 to 3, says how many eighths
+of a pixel each label lies from the far end of its half.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,8 @@ def label_grid(geometry: SweepGeometry) -> LabelGrid:
 def far_ends(u: Float32, v: Float32, plane: Float64, x_lo: Int32, x_hi: Int32, w_far: float) -> Float64:
     """Position of each column's line on each row at inverse depth w_far: (rows, columns) pixels.
 
-    Interpolated between pixels, and extrapolated outside the picture from its last two; NaN where x_lo > x_hi.
+    Interpolated between pixels; outside the picture extrapolated from the last two, or the searched pixel itself if
+    those beside it have no ray. NaN where x_lo > x_hi.
     """
     rows, columns = x_lo.shape
     width = u.shape[1]
@@ -106,7 +107,7 @@ VARIANTS: Final = FRACTIONS // 2
 PHASES: Final = 2
 FAR_PX: Final = MARGIN_PX
 SLACK_PX: Final = 1
-"""Pixels by which a label may lie outside a search window: the mean of a peak at its end needs both sides."""
+"""Pixels by which a label may lie outside a search window: the mean of a peak at the window's end needs both sides."""
 START, VARIANT, ODD, LABEL, LABEL_END, VALID, VALID_END, MEND = range(8)
 """START: x of pixel 0; VARIANT: -1 where nothing is searched; ODD: 1 where label 0 is of phase 1; LABEL, LABEL_END:
 first possible label, and one after the last; VALID, VALID_END: first pixel p that was stored and is read, and one after

@@ -1,10 +1,10 @@
 """The halo's part of the label costs, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-The halo of `rig.estimate.row.inputs` is part of every hypothesis. In the tables of `rig.estimate.joint.labels.tables`
-the halo is as bright everywhere as at the stripe, which is right for the pixels around the stripe. The difference
-elsewhere varies slowly with the stripe's position and from pixel to pixel. So it is tabled for stripes BLOCK_PX apart,
-with linear interpolation, and for the mean counts of blocks of BLOCK_PX pixels (`HaloTables`: int16 weights, float32
-constants in nats per exposure).
+The halo (light of the stripe that fog scatters to both sides, `rig.estimate.row.inputs`) is part of every hypothesis.
+The tables of `rig.estimate.joint.labels.tables` take it to be as bright everywhere as at the stripe, which is right for
+the pixels around the stripe. The difference elsewhere varies slowly with the stripe's position and from pixel to pixel.
+So it is tabled for stripes BLOCK_PX apart, with linear interpolation, and for the mean counts of blocks of BLOCK_PX
+pixels (`HaloTables`: int16 weights, float32 constants in nats per exposure).
 """
 
 from typing import Final, NamedTuple
@@ -39,8 +39,8 @@ _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Tables of the halo. Blocks are counted from FIRST_PX on, places of the stripe, BLOCK_PX apart, from the far end
-    of label 0's pixel.
+    """Tables of the halo. Blocks of pixels are counted from FIRST_PX on, and places of the stripe, which are BLOCK_PX
+    apart, from the far end of label 0's pixel on.
 
     weight: int16 (bands, columns, blocks, lights, places), of the mean count of a block. constant: float32
     (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the
@@ -53,7 +53,7 @@ class HaloTables(NamedTuple):
 
 
 def halo_tables(tables: LabelTables, there: bool) -> HaloTables:
-    """Memory for the tables of a halo, if there is one."""
+    """Memory for the tables of a halo. there: whether there is one."""
     (bands, columns, _), lights = tables.at.shape, LIGHTS * tables.pairs
     blocks = -(-(tables.edge.shape[1] - FIRST_PX) // BLOCK_PX)
     places = -(-(LANES // BLOCK_PX * tables.tap.shape[1] + 1) // LANES) * LANES
@@ -149,8 +149,8 @@ class HaloRoom(NamedTuple):
     """The tables with their sizes, and working memory for a column and a batch of rows.
 
     All int16 unless stated. fitted: (lights, places), constants of all places for a column's exposures; mean:
-    (blocks,), counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place; constant: of
-    the positions, for each row of a batch; which: int32 (BATCH,), each row's index there.
+    (blocks,), mean counts of blocks; level: (lights, places), evidence of the halo for a stripe at each place;
+    constant: of the positions, for each row of a batch; which: int32 (BATCH,), each row's index in `constant`.
     """
 
     tables: HaloTables
@@ -176,7 +176,7 @@ def new_halo_room(halo: HaloTables, constants: int) -> HaloRoom:
 
 @numba.njit(cache=True, nogil=True)
 def fit_halo(halo: HaloRoom, column: int, per_nat: float) -> None:
-    """Fill `halo.fitted` for a column's exposures. column: band * columns + column; per_nat: units x exposures."""
+    """Fill `halo.fitted` for a column's exposures. column: band * columns + column; per_nat: of `mend_rows`."""
     numbers = halo.lights * halo.places
     for j in range(0, numbers, LANES):
         nats = load_float32(halo.tables.constant + 4 * column * numbers, j) * np.float32(per_nat)

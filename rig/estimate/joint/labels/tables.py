@@ -4,12 +4,12 @@ They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is
 probability p' that a pixel fires, p'_B before and p'_E behind the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
-    tap  = logit p'_S - logit p'_B or p'_E          int16: a count at a pixel around a label, for LIGHTS amplitudes;
-                                                    B or E as in the sum of edges: E for farther pixels
+    tap  = logit p'_S - logit (p'_B or p'_E)        int16: a count at a pixel around a label, for LIGHTS amplitudes;
+                                                    E for pixels farther than the label's, else B
     constant, edge_sum: the same of log(1 - p'), float32 per exposure: the number of frames differs between columns
 
-Haze, pedestal and ambient light vary slowly along a line, so the rows of a band share a table for each variant of
-`rig.estimate.joint.labels.grid` that occurs among them. Counts are multiplied with weights by `scaled`.
+Haze, the level behind the stripe and ambient light vary slowly along a line, so the rows of a band share a table for
+each variant of `rig.estimate.joint.labels.grid` that occurs among them. Counts are multiplied with weights by `scaled`.
 
 The stripe's brightness is unknown. Two quantiles of the learned amplitudes are tried, under a halo four, and the score
 of the likeliest is used. The learned prior of positions is not used, since it makes errors larger.
@@ -53,18 +53,18 @@ _NEAR, _FAR = 0, 1
 class LabelTables(NamedTuple):
     """Tables of all bands and columns, see the module.
 
-    P: pixels of a row, V: vectors of pixels that hold labels, the first one being pixel FAR_PX.
+    P: pixels of a row, V: vectors of pixels that hold labels, from pixel FAR_PX on. Phases: far and near half of each.
 
     at: int32 (bands, columns, VARIANTS), index of the table, -1 if there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure if
-    all pixels up to and including each lie behind.
+    a pixel and all farther ones lie behind.
     tap: int16 (tables, V, pairs, taps, PHASES, LIGHTS, LANES), weight of the counts of the pixels around each position.
     constant: float32 (tables, V, pairs, PHASES, LIGHTS, LANES), nats per exposure of each position.
-    span: int16 (tables, 2), first pixel with a weight other than 0, and the one after the last.
+    span: int16 (tables, 2), first pixel with weights and the one after the last; others have weight 0.
     used: int16 (tables,), vectors up to the last one that holds a label of any row.
     fitted_constant, fitted_edge: int16, units of constant and of each pixel's share of edge_sum, for the usual number
     of exposures.
-    hot_x: int16, x of hot pixels, those of row y from hot_start[y] to hot_start[y + 1], int32.
+    hot_x: int16, x of hot pixels; those of row y begin at hot_start[y], int32 (rows + 1,).
     pixels, taps, constants: number of edge, tap and constant entries of a table. pairs: of brightnesses.
     """
 
@@ -110,7 +110,7 @@ def fill_tables(
     state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS x
     pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8
     to 3/8 px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat:
-    units of weight; most: largest sum of a position's weights.
+    units of weight per nat; most: largest sum of the sizes of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]
@@ -169,8 +169,8 @@ def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of a variant (-1: of any) nearest the middle of `rows`, -1 if there is none. Then the first position of
-    all rows of the variant, and the one after the last: two per pixel, counted from the pixel that holds label 0.
+    """The row of a variant (-1: of any) nearest the middle of `rows`, -1 if there is none; the first position of all
+    rows of the variant, and the one after the last. Positions are two per pixel, from the pixel that holds label 0 on.
     """
     middle = (rows[0] + rows[1]) // 2
     best, first, end = -1, 1 << 15, 0
@@ -275,7 +275,7 @@ def _weight(value):  # type: ignore[no-untyped-def]
 BATCH: Final = LANES
 """Rows that go through each step of the work together: while one waits for a result, others go on."""
 SUMS_FROM: Final = LANES - 1
-"""Index of the first sum. The sum up to and including pixel p is stored for p + 1: so it begins a whole vector."""
+"""Index of pixel 0's sum, which is over no pixels. Pixel 1's sum comes next and begins a whole vector."""
 POSITION: Final = PHASES * LIGHTS * LANES
 """Numbers per vector of pixels in a table, for a pair of brightnesses."""
 
@@ -309,12 +309,12 @@ class Fitted(NamedTuple):
 class Buffers(NamedTuple):
     """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
 
-    n: counts of pixels from far to near; sums: score of a change at each pixel from SUMS_FROM on, the first one BASE;
-    score: of pixel and phase; top: the largest score in each lane of each row; in the end the first LANES hold that
-    of each row. cost: uint8, of labels, from that of the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
+    n: counts of pixels from far to near; sums: for each pixel, from SUMS_FROM on, the score if all farther pixels lie
+    behind the stripe; score: of pixel and phase; top: the largest score in each lane of each row; in the end the first
+    LANES hold that of each row. cost: uint8, from the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
     EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
     int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
-    batch; fitted: its place in `Fitted`; shown: first label of the mask, and the one after the last.
+    batch; fitted: its index in `Fitted`; shown: first label that the mask leaves, and the one after the last.
     """
 
     n: Int16
@@ -355,5 +355,5 @@ def new_buffers(tables: LabelTables, labels: int) -> Buffers:
 
 
 def _whole(number: int) -> int:
-    """The next multiple of a cache line's bytes."""
+    """`number` rounded up to a multiple of a cache line's bytes."""
     return -(-number // CACHE_LINE) * CACHE_LINE

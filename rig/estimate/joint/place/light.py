@@ -3,12 +3,13 @@
 With counts n of K frames at the pixels t within LIGHT_PX of a stripe, haze the mean of the haze before and behind, and
 glow the halo per pixel as a share of the light (`measure_light`),
 
-    light = (sum over t of log((K + 1/2) / (K - n_t + 1/2)) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
+    light = sum over t of (log((K + 1/2) / (K - n_t + 1/2)) - ambient_t - haze) / (1 + (2 LIGHT_PX + 1) glow)
 
-in photons per exposure, computed as one logarithm of a product. Blind pixels add nothing to the sum. Haze is
-interpolated between bins of its profile, from a table in which all values of a bin lie side by side.
+in photons per exposure, computed as one logarithm of a product. Blind pixels (BLIND_FLUX) add nothing to the sum. Haze
+is interpolated between bins of its profile, from a table in which all values of a bin lie side by side.
 
-With the flux of each of the TAPS pixels around a stripe of `light` photons, and D = 1 / (e^flux - 1) (`score_places`),
+With the flux of each of the TAPS pixels around a stripe of `light` (scale times pooled amplitude), and
+D = 1 / (e^flux - 1) (`score_places`),
 
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
@@ -137,7 +138,7 @@ def _bins(profile: Float32, glow: Float32) -> Float32:
 
 @numba.njit(cache=True, nogil=True)
 def _find_bins(at: int, width: int, gain: np.float32, w_lo: np.float32, per_w: np.float32, last: np.float32) -> None:
-    """Write each stripe's fractional bin of the profile, and the strength G of haze there."""
+    """Write each stripe's fractional bin of the profile, and the factor G of haze there (`rig.estimate.row.inputs`)."""
     for c in range(0, width, LANES):
         px, py = load_float32(at, _PX * width + c), load_float32(at, _PY * width + c)
         pz, u, v = load_float32(at, _PZ * width + c), load_float32(at, _U * width + c), load_float32(at, _V * width + c)
@@ -256,8 +257,8 @@ def _score(
 ) -> None:  # fmt: skip
     """Fill score and known of LANES stripes.
 
-    of: addresses of the fields of all stripes, here: index of the first of these. seen: address of their counts, with
-    room behind them.
+    of: addresses of the fields of all stripes; here: index of the first of the LANES. seen: address of the counts of
+    the LANES, with room behind them.
     """
     share, growth, own = seen + 4 * _EIGHTS, seen + 8 * _EIGHTS, seen + 12 * _EIGHTS
     fetch_eights(ambient, 0, own)
@@ -290,7 +291,7 @@ def _score(
 
 @numba.njit(forceinline=True)
 def _dark_over_lit(flux):  # type: ignore[no-untyped-def]
-    """1 / (e^flux - 1): the probability that a pixel stays dark over that of firing."""
+    """1 / (e^flux - 1): the probability that a pixel stays dark, divided by that of firing."""
     part = smaller_float(larger_float(flux, LEAST_FLUX), MOST_FLUX) * np.float32(2.0**-_DOUBLINGS)
     grown = part * np.float32(1 / 5040) + np.float32(1 / 720)
     for below in (120.0, 24.0, 6.0, 2.0, 1.0):

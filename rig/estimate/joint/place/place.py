@@ -24,7 +24,7 @@ from rig.threads import RowWorkers
 LIGHT_REACH = 3
 """Rows and columns to either side over which a stripe's brightness is pooled."""
 REACHES = (1, 2)
-"""Rows and columns to either side over which a stripe's place is pooled: the first of these that gives ENOUGH."""
+"""Rows and columns to either side over which a stripe's place is pooled: the first that gives ENOUGH, else the last."""
 LESSON_REACHES = (1, 2, 3, 4)
 """REACHES for the lessons of the first map, whose places are not joined with pairs: joined places of weak stripes are
 so smooth that their brightness would be learned too dark."""
@@ -40,7 +40,7 @@ answers end within 2 px of these. Only in pictures of saturated pixels would str
 BEYOND = 3.0
 """Factor by which brightness may lie beyond the learned amplitudes, either way."""
 DARKEST = 300.0
-"""Largest ratio of the brightest of the four amplitudes to another."""
+"""Largest ratio of the brightest of the four amplitudes of `amplitudes_of` to another."""
 SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
 """Least light of all stripes, in photons per exposure, from which `line_width` gives a width."""
@@ -142,9 +142,9 @@ def line_width(
 
 
 def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
-    """Four amplitudes, dark to bright, that represent those of a map's stripes, and their shares of the stripes.
+    """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of stripes behind each.
 
-    trusted: (rows, columns), which stripes count; None for all.
+    trusted: (rows, columns), which stripes count; None for all. If none counts, the amplitudes are 1.
     """
     found = places.amplitude[places.scale > 0 if trusted is None else trusted & (places.scale > 0)]
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])

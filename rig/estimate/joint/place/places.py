@@ -1,13 +1,13 @@
 """Sub-pixel placing of stripes by one step of Fisher scoring, pooled over neighbours on the same surface.
 
-At its answer each row n gives the slope of its log-likelihood with the stripe's position (the score g) and its Fisher
-information h (`rig.estimate.joint.place.light`). Neighbours on one surface have the same distance d, in px, from the
-position at the far end of the depth range. The pooled value
+The counts around each stripe n give the slope of the log-likelihood with the stripe's position (the score g) and the
+Fisher information h (`rig.estimate.joint.place.light`). Neighbours on one surface have the same distance d, in px, from
+the position at the far end of the depth range. The pooled value
 
     d = sum (h_n d_n + g_n) / sum h_n
 
 is as accurate as the maximum of their common likelihood, and 1 / sqrt(sum h_n) is its standard deviation. Before that,
-each stripe's brightness is pooled; otherwise a dark row would be taken for a brighter one that stands on haze.
+the stripes' brightness is pooled; otherwise a dark stripe would be taken for a brighter one that stands on haze.
 
 Counts are stored column by column, but answers are processed row by row, LANES columns to a vector. So the counts
 around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
@@ -50,10 +50,10 @@ class Places(NamedTuple):
     """Light and place of each stripe, float32 (rows, columns) each.
 
     distance: x from the far end in px, NaN if there is no stripe; light: photons per exposure above haze and ambient
-    light; scale: light at amplitude 1; amplitude: light over scale, pooled; haze, rest: flux above ambient light,
-    before and behind the stripe; glow: halo per pixel at the stripe, as a share of the stripe's light; known: h of the
-    module; score: h times distance, plus g; placed: the final distance; joined, joined_sd: intermediate distance and
-    its standard deviation.
+    light; scale: light at amplitude 1; amplitude: light / scale, pooled; haze, rest: flux above ambient light, before
+    and behind the stripe; glow: halo per pixel at the stripe, as a share of the stripe's light; known: h of the module;
+    score: h times distance, plus g; placed: the final distance; joined, joined_sd: intermediate distance and its
+    standard deviation.
     """
 
     distance: Float32
@@ -72,7 +72,7 @@ class Places(NamedTuple):
 
 @numba.njit(inline="always")
 def most_shown(frames):  # type: ignore[no-untyped-def]
-    """Flux up to which this number of frames measures a pixel's light well: at least DARK_FRAMES of them stay dark."""
+    """Largest flux that so many frames measure well: DARK_FRAMES of them stay dark. FEW_FRAMES_FLUX for few frames."""
     return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
 
 
@@ -85,7 +85,7 @@ def add_moments(
 
     Light is in photons per exposure, without haze, halo and ambient light. Each row of sums belongs to a row of the
     picture. With a halo, stripes that saturate their pixels are left out, since the halo would be taken for their
-    flanks.
+    flanks, and stripes of fewer than LEAST_FRAMES frames.
     """
     for y in range(first_row, last_row):
         for c in range(x_px.shape[1]):

@@ -1,9 +1,9 @@
 """Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, LANES stripes to a
 vector.
 
-Pooling: sums over those neighbours whose distance from the far end differs by at most SAME_PX. Each stripe has other
-such neighbours, so running sums cannot be used. Rows are processed in copies with a margin of NaN (`with_margin`), so
-that no bounds need checking. All arrays are float32 (rows, columns).
+Pooling: sums over those neighbours whose distance from the far end of the depth range differs by at most SAME_PX. Each
+stripe has its own set of them, so running sums cannot be used. Rows are processed in copies with a margin of NaN
+(`with_margin`), so that no bounds need checking. All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
 joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
@@ -11,10 +11,10 @@ its own place d: within SAME_PX, and within SIGMAS times the standard deviation 
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
-with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends they do not agree,
+with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends, pairs do not agree,
 and the stripe stays where it is. Two such rounds reach as far as 25 x 25 neighbours for the work of 16. Neighbourhoods
-overlap, so pairs add less information than 1 / v. In the standard deviation of d' it is multiplied by `share`, which is
-right where all pairs agree.
+overlap, so pairs add less information than 1 / v. In the standard deviation of d', 1 / v is multiplied by `share`,
+which is right where all pairs agree.
 """
 
 from typing import Final
@@ -45,8 +45,8 @@ _LEAST: Final = np.float32(1e-12)
 def pool_row(distance: Float32, first: Float32, second: Float32, y: int, reach: int, sums: Float32) -> None:
     """Fill sums of `first` and `second` over the neighbours of each stripe of row y on its surface, itself included.
 
-    distance, first, second: of `with_margin`; y: counted from their first row after the margin. sums: (2, columns),
-    where the number of columns is a multiple of LANES.
+    distance, first, second: of `with_margin`; y: counted from their first row after the margin. reach: rows and columns
+    to either side. sums: (2, columns), where the number of columns is a multiple of LANES.
     """
     sums[:] = 0.0
     at = address_of(distance), address_of(first), address_of(second)
@@ -89,7 +89,7 @@ def _widen_block(at: tuple[int, int, int], to: int, width: int, here: int, c: in
 def pool_amplitude(
     reach: int, faintest: float, brightest: float, first_row: int, last_row: int, places: Places
 ) -> None:
-    """Fill amplitude: light over scale, each summed over a stripe's neighbours, kept between faintest and brightest."""
+    """Fill amplitude: light / scale, each summed over a stripe's neighbours, kept between faintest and brightest."""
     amplitude, columns = address_of(places.amplitude), places.amplitude.shape[1]
     sums = np.empty((2, -(-columns // LANES) * LANES), np.float32)
     at, width = address_of(sums), sums.shape[1]
@@ -110,9 +110,9 @@ def pool_amplitude(
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its place afterwards, both in px.
+    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its new place, both at most 1 px.
 
-    reaches: sizes of the neighbourhood, smallest first; the first one with `enough` information (1/px^2) is taken.
+    reaches: of neighbourhoods, smallest first; the first with `enough` information (1/px^2) is taken, else the last.
     """
     columns = moved.shape[1]
     # The two sums, the shift, and the standard deviation, which is negative while not known.
@@ -140,7 +140,7 @@ def pool_places(
 
 @numba.njit(cache=True, nogil=True)
 def _settle(lines: int, columns: int, distance: int, enough: float) -> bool:
-    """Place the stripes that are not placed yet and have enough information; returns whether any others are left."""
+    """Place the stripes that are not placed yet and have enough information; returns whether any is left unplaced."""
     one, none, least = zero_float32() + np.float32(1.0), zero_float32(), zero_float32()
     for c in range(0, columns, LANES):
         known, before = load_float32(lines, columns + c), load_float32(lines, 3 * columns + c)

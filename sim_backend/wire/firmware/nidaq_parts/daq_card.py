@@ -69,7 +69,7 @@ class Card:
     # Names and rates
 
     def terminal(self, text: str, code: int = -89120) -> str:
-        """A terminal without the name of the card. code: error if there is none."""
+        """A terminal's name without the card's. Raises DaqmxError with this code if there is no such terminal."""
         local = text.removeprefix("/").removeprefix(f"{self.name}/").lower()
         found = [known for known in (*_PINS, *_CLOCKS, *_TRIGGERS) if known.lower() == local]
         if not found:
@@ -112,14 +112,14 @@ class Card:
     # States
 
     def configure(self, task: Task, **values: Any) -> None:
-        """Set properties of a task."""
+        """Set properties of a task. Raises DaqmxError while it runs."""
         if task.state == ni.RUNNING:
             raise DaqmxError(-200557, f"Task Name: {task.name}")
         for name, value in values.items():
             setattr(task, name, value)
 
     def verify(self, task: Task) -> None:
-        """Check what a client configured."""
+        """Check what a client configured. Raises DaqmxError for the first thing that is wrong."""
         if not task.outputs:
             raise DaqmxError(-200478, f"Task Name: {task.name}")
         if task.kind == "ao" and task.full_v > ni.RANGES_V[-1]:
@@ -220,7 +220,7 @@ class Card:
                 self._open(task, at_s)
 
     def _pause(self, task: Task, at_s: float) -> None:
-        """Generate no more from a time on, since the clock stops. The outputs hold, and others that use it stop too."""
+        """Generate no more from a time on: the clock stops, the outputs hold, and tasks that use the clock stop too."""
         if task.edges is None:
             return
         task.played = task.generated(at_s - 2 * EARLY * task.edges.period_s)

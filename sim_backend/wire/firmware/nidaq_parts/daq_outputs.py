@@ -47,9 +47,8 @@ class Edges:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples of one output at edges of a clock: `count` of them (inf: until it is cut), taken cyclically from `data`,
-    beginning with sample number `first`. The last one holds until the next span.
-    """
+    """A span of one output: samples at edges of a clock, `count` of them (inf: until the span is cut), taken cyclically
+    from `data`, beginning with sample number `first`. The last one holds until the next span."""
 
     edges: Edges
     count: float
@@ -103,7 +102,7 @@ class Output:
         self.play(Samples(Edges(time_s, 1e-9), 1, np.array([value])))
 
     def cut(self, time_s: float) -> None:
-        """Hold the value that the output has right before a time."""
+        """Hold from a time on the value that the output has right before it."""
         with self._lock:
             while self._spans and self._spans[-1].edges.count(time_s) == 0:
                 self._spans.pop()

@@ -90,7 +90,8 @@ class Task:
     limits_v: tuple[float, float] = (0.0, 0.0)
     """Limits of an analogue output, as the client gave them."""
     clocked: bool = False
-    """Whether a clock was configured, or for a counter, how many pulses it makes; without it, one on demand."""
+    """Whether a sample clock was configured, or a counter's number of pulses. Else samples are put out on demand, and a
+    counter makes one pulse."""
     rate_hz: float = 1000.0
     source: str = ""
     continuous: bool = False
