@@ -2,6 +2,7 @@
 
 import logging
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -83,6 +84,9 @@ class BeamScanner(Device):
     """
 
     _has_moved = False
+    on_fault: Callable[[], None] | None = None
+    """Function that is called at once, unless None, on the driver's own thread, if a run fails. Take the gate low in
+    it, and read `status` later. Drivers without a thread of their own never call it."""
 
     @property
     @abstractmethod

@@ -8,6 +8,7 @@ caller's thread itself failed.
 import logging
 import math
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
@@ -160,10 +161,12 @@ class Acquisition:
         keeps_time = isinstance(rig.spad, ReplaySpad) and rig.spad.pace.speed is not None
         ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
-        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, self._on_frame)
+        on_frame = None if rig.guard is None else rig.guard.beat
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
+        rig.scanner.on_fault = self._darken
         if asked.recording is not None:
             asked.recording.begin(sweeps)
         trouble: list[str] = []
@@ -182,7 +185,8 @@ class Acquisition:
                     try:
                         if rig.guard is not None and rig.guard.failure is not None:
                             raise rig.guard.failure
-                        self._require_scanner()  # the SPAD may be silent
+                        if (fault := rig.scanner.status.fault) is not None:  # frames would go on without markers
+                            raise DeviceFault(fault)
                     except DeviceError as error:
                         pipeline.end_source(error)  # no wait: the SPAD itself may be silent
                         break
@@ -207,16 +211,11 @@ class Acquisition:
         finally:
             self._end_start(pipeline, assembler)
 
-    def _on_frame(self, frame: int) -> None:
-        """Tell the guard of the frame, and end the run if the scanner has failed. Runs on the SPAD's thread."""
-        if self._rig.guard is not None:
-            self._rig.guard.beat(frame)
-        self._require_scanner()
-
-    def _require_scanner(self) -> None:
-        """Raise DeviceFault if the scanner has failed: frames would go on without markers."""
-        if (fault := self._rig.scanner.status.fault) is not None:
-            raise DeviceFault(fault)
+    def _darken(self) -> None:
+        """Take the gate low on the thread of a scanner that has failed: the caller's may be at work on a map when its
+        turn comes to end the run. That thread then tries again, and reports it if it fails."""
+        with suppress(DeviceError):
+            self._rig.sync.gate_low()
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
         """The laser guard's time limits for this start. In a burst they allow for silence until it is read out."""

@@ -114,6 +114,10 @@ ETHERDREAM_S = 0.5
 """It plays what is queued: light is gone after this."""
 
 
+CARD_S = 0.6 * CARD_BUFFER_S + GONE_S
+"""A card whose server does not answer is given up after this, and its scan marker stays as it was until then."""
+
+
 def _reset_card(bench: ScanBench) -> None:
     with bench.world.scanner_plug.lock:
         bench.world.scanner.reset(time.monotonic())
@@ -169,9 +173,11 @@ SCAN_STRIKES = {
     # An NI card's scan marker stays as it was.
     "killed, ni card": ScanStrike(_signal(signal.SIGKILL), scanner="nidaq"),
     "ni card's server gone": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="nidaq"),
-    "ni card's server hangs": ScanStrike(lambda bench: bench.world.scanner_plug.hang(), own_end=True, scanner="nidaq"),
+    "ni card's server hangs": ScanStrike(
+        lambda bench: bench.world.scanner_plug.hang(), own_end=True, scanner="nidaq", light_s=CARD_S
+    ),
     "ni card reset": ScanStrike(_reset_card, own_end=True, scanner="nidaq"),
-    "ni card runs dry": ScanStrike(_delay_card, own_end=True, scanner="nidaq"),
+    "ni card runs dry": ScanStrike(_delay_card, own_end=True, scanner="nidaq", light_s=CARD_S),
 }
 
 

@@ -1,6 +1,7 @@
 """The NI card's driver: its config, and what it does to an emulated card. Facts: docs/reference/devices/nidaq.md."""
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -295,6 +296,7 @@ def test_a_lost_server_is_said_by_every_verb_and_close_returns(
     bench: NiBench, moves: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     device = bench.open()
+    device.on_fault = (failed := threading.Event()).set
     device.load(marked(device), 10_000)
     if moves:
         device.start()
@@ -302,6 +304,7 @@ def test_a_lost_server_is_said_by_every_verb_and_close_returns(
     bench.server.unplug()
     with pytest.raises(DeviceDisconnected, match="server lost, while the card keeps its levels"):
         finish(device)
+    assert failed.is_set() == moves
     device.close()
     assert "keeps its levels" in caplog.text
     bench.clock.sleep(1.0)
