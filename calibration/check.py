@@ -118,6 +118,8 @@ def _scanned(model: RigModel, view: View, board: Board) -> Iterator[tuple[Passag
         )
     seen = np.stack(model.camera.tangents_at(*view.corners.px.T), axis=-1)
     to_board, _ = cv2.findHomography(seen, board.corners_m[view.corners.ids, :2])
+    if to_board is None:
+        raise Degenerate("no-board", f"view {view.name}: the corners found do not span the board; show it from nearer")
     for sweep in view.passages:
         rays = np.stack([*model.camera.tangents_at(sweep.x_px, sweep.y_px), np.ones(len(sweep.x_px))], axis=-1)
         rays = rays @ to_board.T

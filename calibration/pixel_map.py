@@ -433,10 +433,12 @@ def load_pixels(path: str | os.PathLike[str]) -> PixelVersion:
         archive = load_arrays(file)
         about: dict[str, Any] = json.loads(str(archive["about"]))
         arrays: dict[str, Any] = {name: archive[name] for name in _ARRAYS}
-        if about["format"] != FORMAT or len({array.shape for array in arrays.values()}) != 1:
-            raise ValueError(f"'format' is {about['format']!r}")
+        dead = archive.get("dead")
+        shapes = {array.shape for array in (*arrays.values(), *([] if dead is None else [dead]))}
+        if about["format"] != FORMAT or len(shapes) != 1:
+            raise ValueError(f"'format' is {about['format']!r}, arrays have shapes {sorted(shapes)}")
         numbers: dict[str, Any] = {name: float(about[name]) for name in _NUMBERS}
-        pixels = PixelMap(**arrays, dead=archive.get("dead"), frames=int(about["frames"]), **numbers)
+        pixels = PixelMap(**arrays, dead=dead, frames=int(about["frames"]), **numbers)
         return PixelVersion(pixels, int(about["version"]), str(about["created"]), about["parent"], str(about["sensor"]))
     except OSError as error:
         raise CalibrationError(f"cannot read {file}: {error.strerror or error}; {_NEXT}") from error

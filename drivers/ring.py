@@ -86,13 +86,15 @@ class BlockRing:
         """A new reader. Raises `WrongState` after the first claim, since all readers are to see all blocks.
 
         holds: number of newest blocks that the reader keeps while it works on them. Raises ValueError if the ring has
-        too few slots for its readers.
+        too few slots for its readers, or for a reader with required=False that holds more than one.
         A reader with required=False (a monitor) never makes the source wait. It occupies one slot at most: it gets the
         newest block. It misses older ones and those published while it holds a block. `skipped` counts what it misses.
         """
         with self._changed:
             if self._any_claimed:
                 raise WrongState(f"ring: reader {name!r} after the first claim; add readers before the source starts")
+            if not required and holds > 1:
+                raise ValueError(f"ring: reader {name!r} is optional and would hold {holds} blocks; it can hold one")
             optional = sum(not reader.required for reader in self._readers) + (not required)
             most = max([holds, *(reader.holds for reader in self._readers)])
             if most + optional > self.slots:

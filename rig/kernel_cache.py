@@ -127,8 +127,10 @@ def _private_folder() -> Path:
     """A folder that only this user can write to, since kernels are code. A new one if the usual one is not safe."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(tempfile.gettempdir()) / f"spadrig-kernels-{user}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    seen = folder.lstat()
-    if hasattr(os, "getuid") and (seen.st_uid != user or seen.st_mode & 0o077 or folder.is_symlink()):
-        return Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))
-    return folder
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        seen = folder.lstat()
+        safe = not hasattr(os, "getuid") or (seen.st_uid == user and not seen.st_mode & 0o077)
+    except FileExistsError:  # a file, or a link to nothing
+        safe = False
+    return folder if safe and not folder.is_symlink() else Path(tempfile.mkdtemp(prefix="spadrig-kernels-"))

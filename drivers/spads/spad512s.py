@@ -357,7 +357,8 @@ class Spad512s(SpadArray):
             try:
                 self._fill(run, ring, timeout_s)
             except DeviceTimeout:
-                raise
+                if not self._halt.is_set():  # else it gave up for that reason
+                    raise
             except BaseException:
                 # What still arrives cannot be distinguished from an answer, so the connection is closed as well.
                 self._run = None

@@ -160,7 +160,7 @@ class Spad512sLine:
             if not _ended(came):
                 self.tell("STOP")
                 came += self.rest()
-        except DeviceDisconnected:
+        except (DeviceDisconnected, DeviceTimeout):  # the program is gone, or takes nothing any more
             came = b""
         if not _ended(came):
             limit_s = self._deadlines.stop_s

@@ -1,5 +1,6 @@
 """`rig calibrate check`: judges a calibration by views of a flat board from which it was not made."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,6 +28,8 @@ from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.requests import CheckRequest
 
+_log = logging.getLogger(__name__)
+
 _BOARD_KEYS = (
     "distance_m", "flatness_rms_m", "flatness_peak_m", "expected_m", "chi2", "freedom", "scale", "scale_sd",
     "point_rms_m",
@@ -50,7 +53,7 @@ def calibrate_check(
     If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
 
     Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, UsageError for a wrong
-    request and for views that the calibration was made from, and OSError if the result cannot be noted.
+    request and for views that the calibration was made from.
     """
     request = replace(request or CheckRequest(), **changes)
     values = si_values(request)
@@ -95,7 +98,10 @@ def calibrate_check(
         result = CalibrationResult(verdict, line, (*_figures(boards, angle), *consequence), summary)
         result = session.finish("check", result, check_report(boards, uncertainty))
         if model.identity is not None:
-            note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
+            try:
+                note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
+            except OSError as error:
+                _log.warning("%s cannot be noted on: %s", file, error.strerror or error)
         return replace(result, model=model)
 
 

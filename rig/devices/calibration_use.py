@@ -146,7 +146,7 @@ def cube_calibration_use(model: RigModel, file: Path | None, *, accept: bool = F
     """The calibration of a cube of frames whose rig is unknown: only the calibration's verdict and noted checks count.
     Raises UsageError as `calibration_use` does.
     """
-    return _used(model, file, refusals(model, file, None), accept)
+    return replace(_used(model, file, refusals(model, file, None), accept), checked=False)
 
 
 def refusals(

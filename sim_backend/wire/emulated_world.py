@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.clock import Clock, now_s
 from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
 from drivers.lasers.ttl import BY_HAND
@@ -110,7 +111,7 @@ class EmulatedWorld(SimulatedWorld):
         self._emission: list[tuple[float, float]] = [(-np.inf, 0.0)]
         """(time, power) of every change of the power in W behind an open gate."""
         self._draw_once()
-        self._frames = WorldFrames(self)
+        self._frames = WorldFrames(self, clock)
         self._wires: list[WireServer[Any]] = []
         bus = bus or EmulatedUsb(clock)
         on_bus = Endpoint("usb", usb_backend=bus if isinstance(bus, EmulatedUsb) else None)
@@ -242,8 +243,10 @@ class EmulatedWorld(SimulatedWorld):
 class WorldFrames:
     """Frames of the simulated world for the emulated SPAD: a `FrameSource` of SPB1 boards, `whole` for the SPAD512S."""
 
-    def __init__(self, world: EmulatedWorld) -> None:
+    def __init__(self, world: EmulatedWorld, clock: Clock) -> None:
         self._world = world
+        self._begun_s = now_s(clock)
+        """Time from which a moving scene moves, as in a simulated world."""
         self._markers = MarkerInputs()
         self._photons: PhotonSource | None = None
         self._made_for: tuple[FrameTimes, FluxModel] | None = None
@@ -255,7 +258,7 @@ class WorldFrames:
     def expose(self, span: Span, records: NDArray[np.void], bits: NDArray[np.uint8] | None) -> int:
         """See `FrameSource`."""
         start_s: Array = span.start_s + np.arange(span.n, dtype=np.float64) * span.period_s
-        self._world.bench.spad_start_s = span.start_s - span.first_frame * span.period_s
+        self._world.bench.spad_start_s = span.start_s - span.first_frame * span.period_s - self._begun_s
         state, power_w = self._world.during(start_s, span.exposure_s, span.period_s)
         sweep = self._markers.record(state, start_s, span.period_s, records)
         x0 = windows_at(span.window, sweep, records)
@@ -263,7 +266,7 @@ class WorldFrames:
         if bits is not None:
             held = self._world.mirror_positions(state, span.period_s)
             source = self._source(FrameTimes(span.exposure_s, span.period_s))
-            source.expose(span.first_frame, held, power_w * state.share, x0, bits, start_s)
+            source.expose(span.first_frame, held, power_w * state.share, x0, bits, start_s - self._begun_s)
         return sweep
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:

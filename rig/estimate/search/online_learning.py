@@ -146,9 +146,9 @@ class OnlineLearner(Generic[Tables]):
                 self._lesson = self._tutor.submit(self._teach, self._made[0], see(), self._taught)
         elif self._frames_since >= LAG_FRAMES:
             # Waits if the lesson is not over: which map is estimated with which model must not depend on speed.
-            setting, self._taught, tables = self._lesson.result()
+            lesson, self._lesson = self._lesson, None
+            setting, self._taught, tables = lesson.result()
             self.model, self._made = setting.model, (setting, tables)
-            self._lesson = None
 
     def _teach(
         self, setting: LearningSetting, seen: Seen, before: Expectation | None

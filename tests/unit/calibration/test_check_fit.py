@@ -9,6 +9,7 @@ import pytest
 from calibration import check
 from calibration.board.board import Board
 from calibration.check import check_angle, check_board
+from calibration.diagnosis.rules import rough_poses
 from calibration.errors import Degenerate
 from calibration.model.camera import Camera
 from calibration.model.parameters import with_parameters
@@ -111,6 +112,12 @@ def test_a_board_that_was_not_found_or_not_scanned_is_refused() -> None:
     view = _view(np.random.default_rng(6), (0.0, 0.3, 0.0), 1.2)
     with pytest.raises(Degenerate, match="0 corners"):
         check_board(_model(), replace(view, corners=None), BOARD)
+    assert view.corners is not None
+    at_one_place = replace(view.corners, px=np.full_like(view.corners.px, 100.0))
+    with pytest.raises(Degenerate, match="do not span the board"):
+        check_board(_model(), replace(view, corners=at_one_place), BOARD)
+    nowhere = replace(view.corners, px=np.full_like(view.corners.px, np.nan))
+    assert rough_poses([replace(view, corners=nowhere)], BOARD, _model().camera) == []
     with pytest.raises(Degenerate, match="no passages"):
         check_board(_model(), replace(view, passages=()), BOARD)
     few = tuple(

@@ -82,6 +82,8 @@ def test_readers_that_could_hold_every_slot_and_a_ring_of_nothing_are_refused() 
         ring.reader("count", holds=2)
     with pytest.raises(ValueError, match="make the ring longer"):
         ring.reader("two", required=False)
+    with pytest.raises(ValueError, match="can hold one"):
+        BlockRing(9, STRIDE).reader("monitor", required=False, holds=2)
     ring = BlockRing(2, STRIDE)
     ring.reader("count", holds=2)
     with pytest.raises(ValueError, match="holds 2 of 2 slots, and 1 optional"):  # in either order

@@ -24,17 +24,19 @@ def _nothing_writable(monkeypatch, tmp_path):
 
 @posix
 @pytest.mark.usefixtures("_nothing_writable")
-@pytest.mark.parametrize("open_to_all", [False, True])
-def test_a_private_folder_serves_where_nothing_can_be_written_and_one_open_to_others_is_not_trusted(
-    tmp_path, open_to_all
-):
+@pytest.mark.parametrize("taken_by", ["nothing", "a folder open to all", "a file", "a link to nothing"])
+def test_a_private_folder_serves_where_nothing_can_be_written_and_one_of_others_is_not_trusted(tmp_path, taken_by):
     usual = tmp_path / f"spadrig-kernels-{os.getuid()}"
-    if open_to_all:
+    if taken_by == "a folder open to all":
         usual.mkdir()
         usual.chmod(0o777)
+    elif taken_by == "a file":
+        usual.touch()
+    elif taken_by == "a link to nothing":
+        usual.symlink_to(tmp_path / "nowhere")
     kernel_cache.prepare_kernels()
     folder = os.environ[kernel_cache.VARIABLE]
-    assert (folder == str(usual)) is not open_to_all
+    assert (folder == str(usual)) is (taken_by == "nothing")
     assert stat.S_IMODE(os.stat(folder).st_mode) == 0o700
 
 

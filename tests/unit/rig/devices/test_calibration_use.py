@@ -13,7 +13,15 @@ from calibration.files.rig_file import load_rig_model, save_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from rig import api
 from rig.config.models import CubePlan
-from rig.devices.calibration_use import carry_notes, identity_of, note_check, recorded_identity, refusals, same_rig
+from rig.devices.calibration_use import (
+    carry_notes,
+    cube_calibration_use,
+    identity_of,
+    note_check,
+    recorded_identity,
+    refusals,
+    same_rig,
+)
 from rig.devices.doctor import examine
 from rig.devices.open import open_rig
 from rig.errors import UsageError
@@ -182,6 +190,7 @@ def test_notes_are_on_one_calibration_and_go_with_what_is_made_from_it(tmp_path:
     save_rig_model(anew, other)
     carry_notes(file, model, other, anew, new_pixels=True)
     assert [each.code for each in refusals(anew, other, None)] == ["failed-check"]
+    assert cube_calibration_use(model, file, accept=True).content()["check"] != "matches", "nothing was compared"
     carry_notes(file, model, other, anew)
     assert [each.code for each in refusals(anew, other, None)] == ["failed-check", "failed-check"]
     (tmp_path / "made-checks.json").write_text("nonsense")

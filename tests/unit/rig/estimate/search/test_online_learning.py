@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -103,6 +104,18 @@ def test_maps_begun_before_earlier_ones_taught_use_the_same_models(taught, learn
 def test_no_map_may_begin_before_the_first_one_has_taught():
     school = OnlineLearner(lambda setting, workers: None, None, learns=True)
     assert not school.certain(0)
+
+
+def test_a_lesson_that_fails_is_told_once(monkeypatch):
+    school = OnlineLearner(lambda setting, workers: None, MODEL, learns=True)
+    school.tables(LearningSetting(MODEL, GEOMETRY, 10, False), WORKERS)
+    monkeypatch.setattr(school, "_teach", lambda *_: 1 / 0)
+    attend = partial(school.attend, stripes(), MODEL)
+    attend(TEACH_FRAMES, lambda: None)
+    with pytest.raises(ZeroDivisionError):
+        attend(LAG_FRAMES, pytest.fail)
+    attend(1, pytest.fail)
+    assert school.model is MODEL
 
 
 def test_an_estimator_that_learns_nothing_keeps_its_model(taught):
