@@ -112,10 +112,9 @@ def rough_poses(views: Sequence[View], board: Board, camera: Camera) -> list[Boa
         if view.corners is None or len(view.corners.ids) < FEWEST_CORNERS:
             continue
         corners_m = board.corners_m[view.corners.ids]
-        try:
-            done, turn, shift = cv2.solvePnP(corners_m, view.corners.px, camera.matrix, camera.distortion)
-        except cv2.error:  # corners without a place
+        if not np.isfinite(view.corners.px).all():
             continue
+        done, turn, shift = cv2.solvePnP(corners_m, view.corners.px, camera.matrix, camera.distortion)
         if done:
             found.append(BoardPose(np.asarray(turn, np.float64).ravel(), np.asarray(shift, np.float64).ravel()))
     return found

@@ -242,7 +242,7 @@ def test_sweeps_are_counted_to_their_end_and_then_markers_open_nothing(keeps_seq
 
 
 @pytest.mark.parametrize("lose", ["unplug", "hang"])
-def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str) -> None:
+def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str, caplog: pytest.LogCaptureFixture) -> None:
     with pulse_box() as box:
         device = box.open(call_s=0.2)
         device.program((GATE,), 100_000)
@@ -250,9 +250,11 @@ def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str) -> 
         assert not device.port_lost
         getattr(box.server, lose)()
         eventually(lambda: device.port_lost)
-        for verb in (lambda: device.status, device.abort, device.close):
+        for verb in (lambda: device.status, device.abort):
             with pytest.raises((DeviceDisconnected, DeviceTimeout)):
                 verb()
+        device.close()
+        assert "turn the laser off by its key" in caplog.text
         with pytest.raises(WrongState, match="open the device again"):
             device.run()
         with pytest.raises(DeviceNotFound, match="Pulse Streamer"):

@@ -169,8 +169,11 @@ def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path: Path) -> None:
         file.write_bytes(content)
         with pytest.raises(CalibrationError, match="holds no map of pixels"):
             pixel_map.load_pixels(file)
-    good = made(real_flux(np.random.default_rng(15), (8, 8)), 1, np.zeros((4, 4), np.bool_))
+    good = made(real_flux(np.random.default_rng(15), (8, 8)), 1, np.zeros((8, 8), np.bool_))
     pixel_map.save_pixels(pixel_map.PixelVersion(good, 1, "", None, ""), file)
+    with np.load(file) as saved:
+        arrays = {**saved, "dead": np.zeros((4, 4), np.bool_)}
+    np.savez(file, **arrays)
     with pytest.raises(CalibrationError, match="holds no map of pixels"):
         pixel_map.load_pixels(file)
     np.savez(file, about=np.array("{}"))
