@@ -1,8 +1,9 @@
 """The commands in recorded control traffic that make a device do something, without the queries between them.
 
-Queries and the numbered lines with which the PrawnDO driver frames a command are left out, because how many there are
-depends on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a serial line
-count once. This module knows the queries of Helios, LaserCube, Cobolt, OBIS and PrawnDO (docs/reference/hardware.md).
+Queries and the numbers with which the drivers of PrawnDO and Teensy mark their lines are left out, because how many
+there are depends on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a
+serial line count once. This module knows the queries of all devices on serial lines, of Helios and of LaserCube
+(docs/reference/hardware.md). Traffic of devices on the network is left out.
 """
 
 import re
@@ -13,9 +14,15 @@ from itertools import accumulate
 
 from drivers.transports.tap import OUT, Passed
 
-_SERIAL = "serial"
+_SERIAL, _NETWORK = "serial", "tcp"
 _LINE_END = re.compile(rb"[\r\n]")
-_QUESTION = re.compile(rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}|0 0|end|ndb")
+_NUMBER = re.compile(rb"^#[0-9a-f]{8} ")
+"""Number before a line for a Teensy."""
+_QUESTION = re.compile(
+    rb"\s*|[ -~]*\?|sts|gto|ver|brd|frq|len|#[0-9a-f]{8}|0 0|end|ndb"  # Cobolt, OBIS, PrawnDO
+    rb"|(sta|status|sh|show) [ -~]*|version"  # iBeam
+    rb"|id|status"  # Teensy
+)
 """Queries, and the lines by which a PrawnDO leaves what another client had begun, which change nothing it plays."""
 _USB_QUESTIONS = {
     "06": (0x03, 0x04, 0x05),  # Helios: status, version, name
@@ -23,7 +30,7 @@ _USB_QUESTIONS = {
 }
 FRAME_PORTS = ("02", "03")
 """Bulk endpoints for points (Helios, LaserCube). Each transfer is a buffer of points, sent when the device has room."""
-BEGIN, END = (b"run", b"swr"), b"abt"
+BEGIN, END = (b"run", b"swr"), (b"abt", b"abort")
 """Commands of the sync source that begin and end a scan. Point buffers sent after the end are left out: they park the
 mirror from wherever it happens to be."""
 
@@ -47,6 +54,8 @@ class Spoken:
         commands: dict[str, list[Passed]] = {}
         buffers: list[Passed] = []
         for (device, port), words in sent.items():
+            if port == _NETWORK:
+                continue
             if port in FRAME_PORTS:
                 buffers += words
             else:
@@ -62,7 +71,7 @@ def _lines(pieces: list[Passed]) -> list[Passed]:
     ends = list(accumulate(len(piece.data) for piece in pieces))
     found, begin, piece = [], 0, 0
     for match in _LINE_END.finditer(stream):
-        line, begin_next = stream[begin : match.start()], match.end()
+        line, begin_next = _NUMBER.sub(b"", stream[begin : match.start()]), match.end()
         while ends[piece] < begin_next:
             piece += 1
         if not _QUESTION.fullmatch(line):
@@ -92,9 +101,10 @@ def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed
         return [buffers]
     scans, begun = [], -1
     for word in sync:
-        if word.data in BEGIN:
+        verb = word.data.partition(b" ")[0]
+        if verb in BEGIN:
             begun = word.t_ns
-        elif word.data == END and begun >= 0:
+        elif verb in END and begun >= 0:
             scans.append([one for one in buffers if begun <= one.t_ns < word.t_ns])
             begun = -1
     return scans

@@ -79,6 +79,28 @@ def test_what_ends_another_clients_leftovers_is_not_compared(tmp_path: Path) -> 
     assert compare(tmp_path, now).problems == ()
 
 
+def newer(power: bytes = b"set power 20", polls: int = 3, number: int = 7) -> Talk:
+    """An iBeam, a Teensy and an Ether Dream."""
+    talk = Talk()
+    for at in range(polls):
+        talk.add(at, "laser", "serial", b"status laser\r\n").add(at, "laser", "serial", b"sh level power\r\n")
+        talk.add(at, "sync", "serial", b"\n#%08x status\n" % (number + at)).add(at, "scanner", "tcp", b"?")
+    talk.add(10, "laser", "serial", power + b"\r\n").add(11, "sync", "serial", b"\n#%08x new 1 50000\n" % number)
+    talk.add(12, "sync", "serial", b"\n#%08x run 2000\n" % number).add(20, "laser", "serial", b"laser off\r\n")
+    return talk.add(30, "sync", "serial", b"\nabort\n").add(31, "sync", "serial", b"\n#%08x abort\n" % number)
+
+
+def test_devices_without_question_marks_and_on_the_network(tmp_path: Path) -> None:
+    recorded = newer().write(tmp_path / "recorded.jsonl")
+    for now, problem in (
+        (newer(polls=9, number=1000), None),
+        (newer(b"set power 30"), "laser: command 0: byte 10 is 0x33, recorded was 0x32"),
+    ):
+        found = check_control(recorded, now.write(tmp_path / "now.jsonl"), devices=DEVICES, tolerance_s=2e-3)
+        assert found.commands == 5
+        assert (problem in found.problems[0]) if problem else not found.problems
+
+
 def with_program(program: bytes) -> Talk:
     now = scan()
     now.lines = [(*line[:4], program) if line[4].startswith(b"\x01\x0a") else line for line in now.lines]
