@@ -154,7 +154,7 @@ class SimulatedWorld:
 
     @property
     def effect_plan(self) -> EffectPlan:
-        """Which effects are simulated, and why. Decided by `plan_for` or at first use, once the devices are made."""
+        """The effects that are simulated, and why. Decided by `plan_for` or at first use, once the devices are made."""
         return self._plan()[0]
 
     @property

@@ -152,8 +152,8 @@ def _lit(scanner: PivotScanner, source_m: Array | None, points_m: Array, command
 
 
 def ray_columns(camera: Camera, terms: Terms, u: Array, v: Array, by_u: Array, by_v: Array) -> Array:
-    """(m, camera terms) derivatives by the camera of a quantity that changes by by_u du + by_v dv with a
-    pixel's ray."""
+    """Derivatives (m, camera terms) of a quantity with respect to the camera's parameters, for fixed pixels. A change
+    (du, dv) of a pixel's ray (u, v, 1) changes the quantity by `by_u` du + `by_v` dv."""
     lens = camera.lens
     ux, uy, vx, vy = lens.undistort_slope(u, v)
     by_x, by_y = by_u * ux + by_v * vx, by_u * uy + by_v * vy

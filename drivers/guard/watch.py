@@ -41,7 +41,7 @@ class GuardLimits:
     waits_within_s: float = 0.04
     """If the source thread reports no frames from the SPAD for longer, work is no excuse: `frames_within_s` holds."""
     first_wait_s: float = 0.3
-    """The same before the first frame."""
+    """Limit in place of `waits_within_s` before the first frame."""
     first_frame_s: float = 1.0
     """Time from `run` to the first frame: SPAD, scanner and the scan marker come in between. An application at work
     gets `busy_within_s` on top, since devices that start and a machine with too much to do may come together."""

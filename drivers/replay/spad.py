@@ -119,7 +119,8 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """A position while reading one start to its end, or up to frame `n_frames` - 1. For use by one thread at a time.
+    """The reading position in one `RecordedRun`, which is read to its end or up to frame `n_frames` - 1. For use by one
+    thread at a time.
 
     by_block: whether each block is a step of `Pace`, because there are no scan markers.
     """

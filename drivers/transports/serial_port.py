@@ -145,8 +145,8 @@ class SerialPort:
         return self._take(len(self._received), 0)
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Drop what arrives until the line is quiet for `quiet_s`, at most for `deadline_s`; returns what was
-        dropped."""
+        """Drop what was received and not read, and what arrives until the line is quiet for `quiet_s`, at most for
+        `deadline_s`; returns what was dropped."""
         ends_at = now_s(self.clock) + deadline_s
         quiet_at = now_s(self.clock) + quiet_s
         while now_s(self.clock) < min(quiet_at, ends_at):

@@ -143,7 +143,7 @@ def _summary(
 
 
 def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
-    """What a failed check changes and how to undo it; empty if it passed or the calibration does not state its rig."""
+    """Lines on what a failed check changes and how to undo it; none if it passed or the calibration states no rig."""
     if verdict.passed or model.identity is None:
         return []
     said = (

@@ -69,7 +69,7 @@ class CoversLens(Protocol):
     """A world that can cover the lens."""
 
     def cover_lens(self) -> None:
-        """Let no light in from now on."""
+        """Let no light in, from the SPAD's next `configure` on."""
         ...
 
 

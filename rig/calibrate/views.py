@@ -88,7 +88,9 @@ def take_live(
     defects: NDArray[np.bool_] | None = None,
     line: bool = True,
 ) -> None:
-    """Take views of a board moved from pose to pose, until as many as requested are good, or more would not help.
+    """Take views of a board moved from pose to pose, until as many as requested are good. It ends before that if
+    `choose` has no further pose, if no other pose would help (`LASTING`), or after MISSED_SHARE more poses than
+    requested.
 
     choose: chooses the poses. ask: asks a person to move the board.
     exposures: per column, used in turn, so that the mirror is seen at several speeds (see `SpeedRotation`); empty: the

@@ -62,7 +62,7 @@ class FogFit:
 
 
 def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
-    """Fit of block sums (blocks, 2, bins, 4). path_m: (bins,). None if too little was seen before stripes.
+    """Fit of block sums (blocks, 2, bins, 4), or None if too little was seen before stripes. path_m: (bins,).
 
     Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
     parameter's error is widened to the sandwich's if that is larger.

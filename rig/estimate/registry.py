@@ -24,7 +24,8 @@ COUPLED = frozenset({"joint"})
 
 
 class Learned(Protocol):
-    """State that an estimator has learned. Its extinction is NaN if the haze does not determine it."""
+    """State that an estimator has learned. Its extinction is NaN if there was too little haze for a fit. If the fit
+    hardly depends on the extinction, the standard deviation is large or infinite."""
 
     @property
     def extinction_per_m(self) -> float:

@@ -178,7 +178,7 @@ class _Export:
         return view
 
     def _make_maps(self) -> str:
-        """How to make missing maps, as text. Raises UsageError if there is no recording to make them of."""
+        """Advice on how to make missing maps. Raises UsageError if there is no recording to make them of."""
         require_recording(self._run)
         return f"make them first: {reconstruct_line(self._run)}, and export that folder"
 

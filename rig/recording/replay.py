@@ -170,7 +170,7 @@ class ReplayFacts:
 
     @property
     def report(self) -> PaceReport:
-        """How late blocks came by the clock of the replay."""
+        """Report on how late blocks came by the clock of the replay."""
         return self._spad.pace.report
 
     @property
@@ -373,7 +373,7 @@ def _part_learned(
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """What `make` makes of a file's arrays; None without the file. Raises DamagedRecordingError if it is unreadable."""
+    """The result of `make` for a file's arrays; None without the file. Raises DamagedRecordingError if it is unreadable."""
     if not file.exists():
         return None
     try:

@@ -219,7 +219,7 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """Which maps of a run are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+    """The maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
 
     step: int | None = 1
 

@@ -269,8 +269,8 @@ class SimulatedSpad(SpadArray):
         return self._info.width if self._window is None else self._window.width_px
 
     def _frames_ahead(self) -> tuple[int, bool]:
-        """How many of the next frames go into one block, and False; or if the next frame gets lost, how many in a row
-        get lost, and True."""
+        """Number of the next frames that go into one block, and False. If the next frame gets lost: the number in a row
+        that get lost, and True."""
         first = self._next_frame
         n = self._block_frames if self._n_frames is None else min(self._block_frames, self._n_frames - first)
         lost = dropped_frames(np.uint64(self._random_seed), first, n, self._config.loss_probability)

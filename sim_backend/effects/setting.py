@@ -17,8 +17,8 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: by name, effects that the
-    rig model has or that simulated devices reported when they were made, with the reason."""
+    """The rig in its scene. gain: detections per second of a pixel per W/(m^2 sr). devices: the effects
+    that the rig model has, or that simulated devices reported when they were made, by name; the values say why."""
 
     view: CameraView
     scene: SceneFile

@@ -246,7 +246,7 @@ LIGHT_SIGMAS = 1.5
 
 
 class SecondLight(NamedTuple):
-    """What the search for second returns needs of a model; made once per model by `second_light`.
+    """Inputs of the search for second returns that depend on the model; made once per model by `second_light`.
 
     state: without ambient light. still: float32, (rows x width) between LANES zeros at either end, the probability that
     a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not be

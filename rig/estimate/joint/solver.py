@@ -115,7 +115,7 @@ class MapSolver:
         return replace(stripes, confidence=trust)
 
     def seen(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Seen:
-        """What the next model is learned from: a part of the last map. stripes: its stripe table."""
+        """The part of the last map from which the next model is learned. stripes: the map's stripe table."""
         quiet = self.quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
         bright = bright_lines(volume, tables, stripes, self.places, self._workers)

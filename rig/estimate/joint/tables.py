@@ -24,7 +24,8 @@ MOST_BYTES = 4 << 30
 
 
 class JointTables(NamedTuple):
-    """Everything that is made once per model, with its inputs; see the module that makes each.
+    """All that `tables_of` makes once per model, geometry and number of exposures, and the inputs that kernels need
+    with it: `sweep`, `state` and `dark`.
 
     contrast: None if not needed. shares: of `profile_table`. halo: of `halo_shares`, without pixels if there is no
     halo. dark: whether there are dark frames.

@@ -6,10 +6,11 @@ below WEAK. Candidates are its own label and those of the four nearest neighbour
 
     sum over 5 x 5 neighbours n of margin_n min(|label - label_n|, FAR),
 
-unless its cost from the row's own counts exceeds that of the old label by more than OBJECTION; then the old one stays.
+unless its own cost, without the messages of neighbours, exceeds that of the old label by more than OBJECTION; then the
+old one stays.
 The new margin is the sum of the margins of neighbours within SAME of the label, less that of all others, divided by the
-number of neighbours (the answer included) and at least 0. So where streaks disagree, margins are small. Labels are
-int16, margins uint8 in units of cost; sums fit 16 bits (SHARE).
+number of neighbours (the answer included) and at least 0. So where streaks disagree, margins are small. The vote
+rounds labels to int16 and divides margins (uint8, in units of cost) by SHARE, so that sums fit 16 bits.
 """
 
 from typing import Final, NamedTuple

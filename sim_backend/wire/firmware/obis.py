@@ -151,7 +151,8 @@ class ObisModel:
         self._tell()
 
     def power_up(self, now_s: float) -> None:
-        """Take the supply away and give it back: with autostart and the key on, the laser switches itself on."""
+        """Take the supply away and give it back: with autostart the laser switches itself on, unless something forbids
+        it (`able`)."""
         self._now_s = now_s
         self._pending, self._warm_at_s, self._said_until_s = "", None, float("-inf")
         self.state_on, self._lit_at_s = False, None

@@ -157,7 +157,8 @@ class Task:
         return int(min(self.played + self.edges.count(now_s), most))
 
     def ends_s(self) -> float:
-        """Time at which the generation ends by itself: its last sample has come out, or none is left."""
+        """Time at which the generation ends by itself: after its last sample, or when a sample is due that the client
+        has not written. Infinite if neither happens."""
         if self.edges is None:
             return np.inf
         if self.kind == "co":
