@@ -373,7 +373,7 @@ def _part_learned(
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """The result of `make` for a file's arrays; None without the file. Raises DamagedRecordingError if it is unreadable."""
+    """The result of `make` for a file's arrays; None without the file. Raises DamagedRecordingError for damaged ones."""
     if not file.exists():
         return None
     try:
