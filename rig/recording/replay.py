@@ -373,7 +373,7 @@ def _part_learned(
 
 
 def _kept(file: Path, make: Callable[[dict[str, NDArray[Any]]], T]) -> T | None:
-    """The result of `make` for a file's arrays; None without the file. Raises DamagedRecordingError for damaged ones."""
+    """The result of `make` for the arrays of a file; None without one. Raises DamagedRecordingError if damaged."""
     if not file.exists():
         return None
     try:
