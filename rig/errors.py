@@ -75,4 +75,4 @@ class DivergedError(RigError):
 
 
 class DamagedRecordingError(RigError):
-    """Raised when the files of a recording are damaged. The message says what can help."""
+    """Raised when the files of a recording are damaged. The message says what can help, if anything is known."""

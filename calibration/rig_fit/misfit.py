@@ -241,7 +241,8 @@ class Misfit(NamedTuple):
         return max(found)
 
     def without(self, gain: float) -> float:
-        """The factor that would remain if chi2 fell by `gain`."""
+        """1 plus the excess of both chi2 that would remain if chi2 fell by `gain`, divided by the degrees of freedom of
+        `slow`. Unlike `factor` it adds both parts and tests no significance."""
         excess = sum(max(chi2 - free, 0.0) for chi2, free in self)
         return max(1.0, 1 + (excess - gain) / max(self.slow[1], 1.0))
 

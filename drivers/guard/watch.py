@@ -162,8 +162,8 @@ class WatchedProcess:
         """Whether its threads worked for a good part of the time since `note_progress`, or run or wait for a processor
         or a disk now.
 
-        The answer is False only if two looks in a row find the process asleep: threads are looked at one after the
-        other, and work may pass from a thread not yet looked at to one that already was.
+        The answer is False only if this call and the one before both find the process asleep: threads are looked at one
+        after the other, and work may pass from a thread not yet looked at to one that already was.
         """
         asleep_before, self._found_asleep = self._found_asleep, self._asleep()
         return not (asleep_before and self._found_asleep)

@@ -76,7 +76,7 @@ class IbeamFraming:
 
     def prepare(self, port: SerialPort) -> None:
         """Switch echo and prompt off, whatever state they are in, and note that state. If the laser answers each
-        command with the reply to the one before, tells it to switch off and raises `DeviceFault`."""
+        command with the reply to the one before, it is told to switch off, and `DeviceFault` is raised."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
         self.echo, self.prompt = b"echo off" in echoed, _PROMPT in said + echoed

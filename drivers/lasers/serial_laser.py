@@ -136,8 +136,8 @@ class SerialLaser(LineLaser):
         return self._line.port.lost
 
     def watch_for_end(self, off: bytes) -> None:
-        """See to it that the light ends if the laser is deleted, or the program ends, before `close`, or if `close`
-        could not pause it. off: bytes that switch it off in any state."""
+        """Have the laser told to switch off if it is deleted, or Python ends in the normal way, before `close`, or if
+        `close` could not pause it. A failure is only logged. off: bytes that switch it off in any state."""
         self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, os.getpid())
 
     def _do_close(self) -> None:

@@ -258,7 +258,8 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
 
 
 def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report:
-    """Make the report on a calibration of the camera alone. views: those that the fit used."""
+    """Make the report on a calibration of the camera alone. views: those that `fit.views` names, in this order,
+    outliers included."""
     rows = [
         (
             name + (" (outlier)" if name in fit.outliers else ""),

@@ -38,7 +38,8 @@ class ForeignFrames:
 
 
 def gather(files: Iterable[str | os.PathLike[str]], suffix: str) -> list[Path]:
-    """List the given files in their order. A folder stands for all files with `suffix` in it and its subfolders.
+    """List the given files in their order. A folder stands for all files in it and its subfolders whose names end with
+    `suffix`.
 
     A folder's files come in natural order (2 before 10), as the cameras number them. Raises UsageError if a file is
     missing, a folder holds none, or nothing is named.

@@ -95,10 +95,11 @@ class CommandGrid:
     high: float
 
     def hold(self, commands: Array, steps: Array) -> Array:
-        """For frames at commands (n,): the mean position of all frames in the same cell; NaN outside the grid.
+        """For frames at commands (n,): the mean position that the frames in a frame's cell would have if the mirror
+        crossed the cell at this frame's step; NaN outside the grid.
 
         steps: (n,) how far the mirror moves from one frame to the next. A frame with step 0, or alone in its cell,
-        keeps its own position. NaN means unknown: the frame gets the cell's own position.
+        keeps its own position. If its step is NaN (unknown), a frame gets the cell's own position.
         """
         if len(self.positions) == 0:
             return np.full(commands.shape, np.nan)

@@ -352,7 +352,8 @@ def stripe_table(
     x_px: Float32, sd_px: Float32, n_frames: Int32, answer: LabelAnswers, places: Places, pairs: Float32,
     bright: Brightness, workers: RowWorkers,
 ) -> StripeTable:  # fmt: skip
-    """The stripe table of a map; arrays (rows, columns), x_px NaN without data. pairs: of `pairs_to_ask`."""
+    """The stripe table of a map. n_frames: (columns,); pairs: of `pairs_to_ask`; other arrays: (rows, columns). x_px is
+    NaN without data, and sd_px is set to NaN there."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
     neighbours = new_neighbours(pairs)
 

@@ -72,9 +72,9 @@ class AnswerSettings(NamedTuple):
 class LabelAnswers(NamedTuple):
     """Answers of a map, (rows, columns) each. Positions are counted in labels, costs in units (`UNITS`).
 
-    label: float32, weighted mean of the labels around the winner, the smallest label with the least total. The mean
-    extends only as far as both sides have labels, since a single side would draw every answer to it. margin: uint8, the
-    least total at least MARGIN_FROM labels away minus the winner's.
+    label: float32, weighted mean of the labels around the winner, which is the label with the least total (of equal
+    ones the smallest). The mean extends only as far as both sides have labels, since a single side would draw every
+    answer to it. margin: uint8, the least total at least MARGIN_FROM labels away minus the winner's.
     """
 
     label: Float32

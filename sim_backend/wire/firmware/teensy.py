@@ -118,7 +118,7 @@ class TeensyModel(OutputLevels):
         self.dtr = True
 
     def short(self, outputs: int, at_s: float) -> None:
-        """Connect these outputs to 3.3 V from outside, which shows when they are read back."""
+        """Connect these outputs, and only these, to 3.3 V from outside, which shows when they are read back."""
         self.advance(at_s)
         driven = self._levels[-1] & ~self._shorted
         self._shorted = outputs

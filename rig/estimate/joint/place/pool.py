@@ -12,9 +12,9 @@ its own place d: within SAME_PX, and within SIGMAS times the standard deviation 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
 with standard deviations s of the stripe, and s1 and s2 of the pair. Where a surface ends or bends, pairs do not agree,
-and the stripe stays where it is. Two such rounds reach as far as 25 x 25 neighbours for the work of 16. Neighbourhoods
-overlap, so pairs add less information than 1 / v. In the standard deviation of d', 1 / v is multiplied by `share`,
-which is right where all pairs agree.
+and the stripe stays where it is. After pooling over 5 x 5, two such rounds reach as far as 25 x 25 neighbours,
+with 8 neighbours each. Neighbourhoods overlap, so pairs add less information than 1 / v. In the standard deviation of
+d', 1 / v is multiplied by `share`, which is right where all pairs agree.
 """
 
 from typing import Final

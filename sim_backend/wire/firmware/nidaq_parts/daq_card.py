@@ -18,7 +18,8 @@ _TRIGGERS: Final = tuple(f"{part}/StartTrigger" for part in ("ai", "ao", "di", "
 
 
 class Card:
-    """The card and its tasks. `outputs` has what every output did and will do, in V and in levels 0 and 1."""
+    """The card and its tasks. `outputs` has what every output did in the last KEEP_S and will do: analogue ones in V,
+    others as levels 0 and 1."""
 
     name: Final = "Dev1"
 
