@@ -261,6 +261,8 @@ def trouble_of(name: str, outcome: ScanOutcome) -> list[str]:
     if "Traceback" in outcome.said:
         found.append("a traceback")
     ended_well = "verdict  complete" in outcome.said  # it had its frames already
-    if made.own_end and not ended_well and not (outcome.code == 3 and "error: " in outcome.said):
+    # A laser that went off may be found by its missing line before it is asked.
+    told = (outcome.code == 3 and "error: " in outcome.said) or "no line: " in outcome.said
+    if made.own_end and not ended_well and not told:
         found.append(f"code {outcome.code}")
     return [f"{one} ({outcome.said.strip()[-300:]})" for one in found]
