@@ -14,6 +14,10 @@ class DeviceNotFound(DeviceError):
     """
 
 
+class NoAnswer(DeviceNotFound):
+    """Raised when a port is there, but nothing on it answers as the kind to be opened does."""
+
+
 class DeviceBusy(DeviceError):
     """Raised when a device to be opened is held by another program."""
 

@@ -32,7 +32,7 @@ from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
-from drivers.transports.serial_port import OFF_TIMES, SerialPort, configured_port
+from drivers.transports.serial_port import SerialPort, configured_port
 
 _log = logging.getLogger(__name__)
 
@@ -166,8 +166,9 @@ class GuardProcess:
         finally:
             if verb in _ENABLING:
                 owned.enabling = False
-        if owned.slot == "sync" and (verb in ("gate_low", "abort", "close") or (verb == "run" and "error" in answer)):
-            self._watch.stop()
+        lowers = verb in ("gate_low", "abort", "close")
+        if owned.slot == "sync" and ((lowers and "error" not in answer) or (verb == "run" and "error" in answer)):
+            self._watch.stop()  # no light can come out any more
         self._channel.send(answer)
 
     # Watching
@@ -345,6 +346,10 @@ def main(arguments: list[str]) -> int:
 FREE_S = 1.0
 """Time for the kernel to free the ports of a process that ended."""
 _RETRY_S = 0.005
+
+
+OFF_TIMES = 2
+"""Number of times that `Kind.off` is sent: the laser may ignore the first, since the guard may just have asked it."""
 
 
 class Rescue:

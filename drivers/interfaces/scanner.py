@@ -86,7 +86,8 @@ class BeamScanner(Device):
     _has_moved = False
     on_fault: Callable[[], None] | None = None
     """Function that is called at once, unless None, on the driver's own thread, if a run fails. Take the gate low in
-    it, and read `status` later. Drivers without a thread of their own never call it."""
+    it, and read `status` later. Its errors are only logged. Drivers without a thread of
+    their own never call it."""
 
     @property
     @abstractmethod

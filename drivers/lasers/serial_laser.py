@@ -20,6 +20,7 @@ from drivers.errors import (
     DeviceTimeout,
     InterlockOpen,
     LimitExceeded,
+    NoAnswer,
     ProtocolError,
     WrongState,
 )
@@ -28,7 +29,7 @@ from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming
 from drivers.transports.endpoints import resolve
-from drivers.transports.serial_port import BAUD, OFF_TIMES, SerialPort
+from drivers.transports.serial_port import BAUD, SerialPort
 from drivers.units import Watts
 
 
@@ -56,6 +57,11 @@ class _Light:
     may_shine = False
 
 
+_OFF_TIMES = 3
+"""Number of times that the bytes that switch off are sent: the first may end a command that was cut short, and the
+second may come too soon after a reply to be heard."""
+
+
 def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: int) -> None:
     """Close the port of a laser that is closed or deleted; first switch it off by the bytes `off` if it may shine. Only
     logs errors. process: number of the laser's process; in another one, which was forked from it, nothing is done."""
@@ -63,7 +69,7 @@ def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: 
         return
     if light.may_shine:
         try:
-            port.write_again(off, OFF_TIMES)
+            port.write_again(off, _OFF_TIMES)
             _log.warning("%s: was left armed; it was told to switch off", name)
         except DeviceError as error:
             _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)
@@ -173,7 +179,7 @@ def open_laser(
         try:
             line.connect()
         except (DeviceTimeout, ProtocolError):
-            raise DeviceNotFound(
+            raise NoAnswer(
                 f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
             ) from None
         laser = identify(line)

@@ -53,8 +53,10 @@ class Spoken:
                 sent[one.device, one.port].append(one)
         commands: dict[str, list[Passed]] = {}
         buffers: list[Passed] = []
+        networked: set[str] = set()
         for (device, port), words in sent.items():
             if port == _NETWORK:
+                networked.add(device)
                 continue
             if port in FRAME_PORTS:
                 buffers += words
@@ -62,7 +64,8 @@ class Spoken:
                 asked = _USB_QUESTIONS.get(port, ())
                 said = _once(_lines(words)) if port == _SERIAL else [one for one in words if one.data[0] not in asked]
                 commands.setdefault(device, []).extend(said)
-        return cls(commands, _scans(commands.get("sync"), buffers))
+        # Without the commands of the sync source nobody knows which buffers are a scan's.
+        return cls(commands, [] if "sync" in networked else _scans(commands.get("sync"), buffers))
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:

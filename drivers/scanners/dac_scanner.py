@@ -324,9 +324,12 @@ class DacScanner(BeamScanner):
             self._position = run.source.last
         except Exception as error:  # a driver's own fault too must end a scan: its frames have no markers any more
             self._error = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
-            if self.on_fault is not None:
-                self.on_fault()
             _log.error("%s", error)
+            try:
+                if self.on_fault is not None:
+                    self.on_fault()
+            except Exception:  # the run is given up all the same
+                _log.exception("%s: on_fault", self.name)
             run.give_up()
 
     def _rest(self) -> float:

@@ -43,9 +43,6 @@ BAUD = 115_200
 AGAIN_S = 0.11
 """Pause after bytes that are sent several times: a Cobolt ignores a command within 0.1 s of its last answer
 (docs/reference/devices/cobolt.md)."""
-OFF_TIMES = 2
-"""Number of times that the bytes which switch a laser off are sent. A laser may ignore the first time, if it has just
-answered a query."""
 _MAX_LINE_BYTES = 65_536
 """Longer than any reply to a command: beyond it the line is noise without an end."""
 

@@ -82,7 +82,9 @@ def calibrate_check(
         verdict = judge_check(boards, wanted, board.size_m[0], angle, stated_rad)
         uncertainty = None if model.covariance is None else depth_uncertainty(model, wanted.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
-        consequence = _consequence(verdict, model, file)
+        refused = not verdict.passed and model.identity is not None
+        noted = model.identity is None or _noted(file, model, verdict)
+        consequence = _consequence(file, noted=noted) if refused else []
         summary = {
             "verdict": verdict.as_json(),
             "calibration": str(file),
@@ -90,18 +92,13 @@ def calibrate_check(
             "angle": None
             if angle is None
             else {"rad": angle.angle_rad, "sd_rad": angle.sd_rad, "stated_rad": stated_rad},
-            "scans_refuse_it": bool(consequence),
+            "scans_refuse_it": refused and noted,
             "truth": truth_content(true_errors(model, live, wanted.at_m)),
         }
         tell_stage("writing the report")
         session.identity = session.identity or model.identity
         result = CalibrationResult(verdict, line, (*_figures(boards, angle), *consequence), summary)
         result = session.finish("check", result, check_report(boards, uncertainty))
-        if model.identity is not None:
-            try:
-                note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
-            except OSError as error:
-                _log.warning("%s cannot be noted on: %s", file, error.strerror or error)
         return replace(result, model=model)
 
 
@@ -142,15 +139,23 @@ def _summary(
     }
 
 
-def _consequence(verdict: Verdict, model: RigModel, file: Path) -> list[tuple[str, str]]:
-    """Lines on what a failed check changes and how to undo it; none if it passed or the calibration states no rig."""
-    if verdict.passed or model.identity is None:
-        return []
-    said = (
+def _noted(file: Path, model: RigModel, verdict: Verdict) -> bool:
+    """Note the check beside the calibration; returns whether that could be done."""
+    try:
+        note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
+    except OSError as error:
+        _log.warning("%s cannot be noted on: %s", file, error.strerror or error)
+        return False
+    return True
+
+
+def _consequence(file: Path, *, noted: bool) -> list[tuple[str, str]]:
+    """Line on what a failed check changes, and how to undo it. noted: whether it could be noted."""
+    refused = (
         f"scan, replay and reconstruct refuse {file} (or take it with --accept-calibration); a check of it that "
         "passes, with the right angle or board, takes that back"
     )
-    return [("from now on", said)]
+    return [("from now on", refused if noted else f"nothing refuses {file}: the check could not be noted beside it")]
 
 
 def _figures(boards: Sequence[CheckedBoard], angle: CheckedAngle | None) -> list[tuple[str, str]]:

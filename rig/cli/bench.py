@@ -11,7 +11,7 @@ from rig.cli.progress import progress
 
 def bench_command(
     threads: Annotated[
-        int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1)
+        int | None, typer.Option("--threads", help="most threads to measure", show_default="one a core", min=1, max=256)
     ] = None,
     soak: Annotated[
         float | None,

@@ -12,17 +12,19 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.clock import Clock, SystemClock, VirtualClock
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceTimeout, NoAnswer, ProtocolError
 from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
 from drivers.registry import KindConfig, Surroundings, lookup
 from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
-from drivers.transports.serial_port import OFF_TIMES, configured_port
+from drivers.transports.serial_port import configured_port
 from drivers.transports.tap import Tap, TapFile
 from rig.config.models import RigConfig
 from rig.errors import DevicesError, UsageError
 from rig.recording.cube import cube_columns
 
+_OFF_TIMES = 3
+"""Number of times that a laser which does not answer is told to switch off."""
 GUARDED = ("laser", "sync")
 """Slots of the devices that let light out. If they are real, a separate process (the guard) owns them."""
 DEVICES = ("spad", "scanner", "laser", "sync")
@@ -96,20 +98,23 @@ def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSour
             try:
                 opened[slot] = stack.enter_context(_create(slot, getattr(config, slot), surroundings))
             except Exception as error:  # an error of one device must not keep the other one on
-                trouble.append(f"{slot}: {error}{_switched_off_unheard(slot, getattr(config, slot), surroundings)}")
+                silent = isinstance(error, NoAnswer | DeviceTimeout | ProtocolError)
+                told = _told_off(slot, getattr(config, slot), surroundings) if silent else ""
+                trouble.append(f"{slot}: {error}{told}")
         yield opened["sync"], opened["laser"]
 
 
-def _switched_off_unheard(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
+def _told_off(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
+    """Send the bytes that switch off to a device that does not answer; returns what to say about it."""
     kind = lookup(slot, config.kind)
     if kind.off is None:
         return ""
     try:
         with closing(configured_port(slot, config, surroundings.ports)) as port:
-            port.write_again(kind.off(config), OFF_TIMES)
-    except DeviceError:
-        return ""  # the first error says what is wrong with the port
-    return " (it was told to switch off all the same, but did not answer: look whether it is dark)"
+            port.write_again(kind.off(config), _OFF_TIMES)
+    except Exception:
+        return ""  # the first error says what is wrong
+    return " (it was told to switch off all the same; look whether it is dark)"
 
 
 def check_files(config: RigConfig) -> None:

@@ -213,9 +213,13 @@ class Acquisition:
 
     def _darken(self) -> None:
         """Take the gate low on the thread of a scanner that has failed: the caller's may be at work on a map when its
-        turn comes to end the run. That thread then tries again, and reports it if it fails."""
-        with suppress(DeviceError):
+        turn comes to end the run. If that fails, the laser is paused; the caller's thread then tries again, and reports
+        it."""
+        try:
             self._rig.sync.gate_low()
+        except DeviceError:
+            with suppress(DeviceError):
+                self._rig.laser.pause()
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
         """The laser guard's time limits for this start. In a burst they allow for silence until it is read out."""

@@ -42,7 +42,8 @@ class ScanStrike:
     """A blow. at_once: it may come before any light. record: frames are written. own_end: the application goes on
     living, says what happened and ends with code 3. silence: of the SPAD that the guard lets pass; long, since
     an emulated one may itself be late. scanner, sync: their kinds. labours: threads fight the scan's for the
-    interpreter. light_s, emission_s: until they are gone, at most."""
+    interpreter. darkens: it ends the light itself, and all else goes on. light_s, emission_s: until they are gone,
+    at most."""
 
     blow: Callable[[ScanBench], None]
     at_once: bool = False
@@ -55,6 +56,7 @@ class ScanStrike:
     light_s: float = GONE_S
     emission_s: float = EMISSION_S
     sync: str = "prawndo"
+    darkens: bool = False
 
 
 def _signal(number: int) -> Callable[[ScanBench], None]:
@@ -165,7 +167,7 @@ SCAN_STRIKES = {
         light_s=HUNG_S,
         emission_s=HUNG_S,
     ),
-    "interlock opened": ScanStrike(_open_interlock, own_end=True),
+    "interlock opened": ScanStrike(_open_interlock, own_end=True, darkens=True),
     "disk full": ScanStrike(_fill_disk, record=True, own_end=True),
     "killed, teensy": ScanStrike(_signal(signal.SIGKILL), sync="teensy"),
     "teensy hangs": ScanStrike(_hang_gate, sync="teensy", light_s=NEVER_S),
@@ -261,8 +263,9 @@ def trouble_of(name: str, outcome: ScanOutcome) -> list[str]:
     if "Traceback" in outcome.said:
         found.append("a traceback")
     ended_well = "verdict  complete" in outcome.said  # it had its frames already
-    # A laser that went off may be found by its missing line before it is asked.
-    told = (outcome.code == 3 and "error: " in outcome.said) or "no line: " in outcome.said
+    told = outcome.code == 3 and "error: " in outcome.said
+    if made.darkens:  # its missing line may be found before the laser is asked
+        told |= outcome.code == 1 and "no line: " in outcome.said
     if made.own_end and not ended_well and not told:
         found.append(f"code {outcome.code}")
     return [f"{one} ({outcome.said.strip()[-300:]})" for one in found]

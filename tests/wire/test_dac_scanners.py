@@ -119,11 +119,23 @@ def test_a_firmware_that_hangs_ends_the_run_within_its_deadline(kind: Kind) -> N
         device.close()
 
 
-def test_a_fault_of_the_driver_itself_is_told_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_the_driver_itself_is_told_too(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     with opened("helios", HeliosRecorder()) as (device, _):
+        done: list[str] = []
         monkeypatch.setattr(HeliosRun, "feed", lambda *_: 1 / 0)
+        monkeypatch.setattr(HeliosRun, "give_up", lambda _: done.append("given up"))
+
+        def fails() -> None:
+            done.append("told")
+            raise RuntimeError("no gate")
+
+        device.on_fault = fails
         play(device, 3)
         monkeypatch.undo()
+        assert done == ["told", "given up"]
+        assert "no gate" in caplog.text
         assert device.status.fault is not None
         assert "ZeroDivisionError" in device.status.fault
 

@@ -241,6 +241,17 @@ def test_sweeps_are_counted_to_their_end_and_then_markers_open_nothing(keeps_seq
         assert [level for _, level in box.changes(begun_s)].count(OUT_GATE) >= 3, "none is left out"
 
 
+def test_a_close_whose_abort_failed_takes_the_outputs_low_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pulse_box() as box:
+        device = box.open()
+        device.program((Pulse(OUT_GATE, 10.0),), 1)
+        device.run()
+        assert box.pins
+        monkeypatch.setattr(device, "_do_abort", lambda: (_ for _ in ()).throw(DeviceDisconnected("for a moment")))
+        device.close()
+        assert not box.pins
+
+
 @pytest.mark.parametrize("lose", ["unplug", "hang"])
 def test_a_box_that_is_lost_is_told_to_the_guard_and_at_the_close(lose: str, caplog: pytest.LogCaptureFixture) -> None:
     with pulse_box() as box:

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from drivers.clock import VirtualClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
+from drivers.guard.process import OFF_TIMES
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt as cobolt_framing
 from drivers.lasers import ibeam as ibeam_framing
@@ -21,7 +22,7 @@ from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import SerialLaserConfig
 from drivers.registry import kinds, lookup
 from drivers.transports.dialogue import FairLock
-from drivers.transports.serial_port import AGAIN_S, OFF_TIMES
+from drivers.transports.serial_port import AGAIN_S
 from rig.config.files import load_config
 from rig.devices import open as session
 from rig.devices.doctor import laser_off
@@ -116,6 +117,20 @@ def test_a_laser_that_hears_but_does_not_answer_is_switched_off(name: str, monke
         with pytest.raises(DevicesError, match="told to switch off all the same"):
             laser_off(config)
     assert not model.emitting
+
+
+def test_another_laser_than_the_config_names_is_not_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, clock = OBIS.model(), VirtualClock()
+    other = ObisConfig.model_validate({"kind": "obis", **USUAL, "serial_number": "other"})
+    with wire(model, clock=clock) as (_, surroundings):
+        bring_up(laser := OBIS.open(surroundings), clock)
+        laser._line.port.close()  # type: ignore[attr-defined]
+        monkeypatch.setattr(session, "surroundings_of", lambda *_: surroundings)
+        config = load_config("simulated").model_copy(update={"laser": other})
+        with pytest.raises(DevicesError, match="not other; correct 'serial_number' or 'port'") as raised:
+            laser_off(config)
+        assert "told to switch off" not in str(raised.value)
+    assert model.emitting
 
 
 @each_make

@@ -377,13 +377,18 @@ def test_a_program_that_ends_or_hangs_within_a_run_is_said_so() -> None:
         assert len(take(device, 16)) == 1
 
 
-def test_a_stop_while_the_ring_is_full_and_waits_ends_the_run_without_an_error() -> None:
+def test_a_stop_while_the_ring_is_full_and_waits_ends_the_run_without_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     with connected(Spad512sModel(noise)) as (device, _):
         ring, _ = begin(device, REQUEST, 160, 1, OnFull.WAIT)
         assert device.fill(ring, PATIENCE_S)
         more: list[bool] = []
+        waits, claim = threading.Event(), ring.claim
+        monkeypatch.setattr(ring, "claim", lambda timeout_s: waits.set() or claim(timeout_s))
         filling = threading.Thread(target=lambda: more.append(device.fill(ring, PATIENCE_S)))
         filling.start()
+        assert waits.wait(PATIENCE_S)
         device.stop()
         filling.join(PATIENCE_S)
         assert more == [False]

@@ -1,5 +1,7 @@
 """SPB1 under random geometry and random damage: nothing wrong is ever delivered, nothing sound is ever missed."""
 
+import struct
+import zlib
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -9,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from drivers.errors import UnsupportedBlock
+from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.spb1 import ALIGN, BlockLayout, Damage, block_views, frames_per_block, parse_block, seal_block, walk_blocks
+from drivers.spb1.layout import HEADER_BYTES, IDLE, TRAILER_BYTES, seal_control
+from drivers.spb1.reader import read_control, read_header
 from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER, golden_block
 
 FEW = settings(max_examples=150, deadline=None)
@@ -44,6 +48,18 @@ def written_block(layout: BlockLayout, stride: int, seq: int, rng: np.random.Gen
 
 def content(block: FrameBlock) -> tuple[BlockHeader, bytes, bytes]:
     return block.header, block.records.tobytes(), block.bits.tobytes()
+
+
+def test_a_control_block_of_which_a_part_is_valid_is_checked_whole() -> None:
+    memory, end = np.zeros(512, np.uint8), HEADER_BYTES + 10
+    seal_control(memory, IDLE, 1, b"0123456789")
+    trailer = memory.data[end : end + TRAILER_BYTES]
+    struct.pack_into("<I", trailer, 16, 4)  # valid bytes
+    struct.pack_into("<I", trailer, TRAILER_BYTES - 4, zlib.crc32(trailer[:-4]))
+    assert read_control(memory, read_header(memory)) == b"0123"
+    memory[end - 1] ^= 1
+    with pytest.raises(CorruptBlock, match="control block: CRC"):
+        read_control(memory, read_header(memory))
 
 
 @FEW

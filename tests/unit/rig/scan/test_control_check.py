@@ -101,6 +101,19 @@ def test_devices_without_question_marks_and_on_the_network(tmp_path: Path) -> No
         assert (problem in found.problems[0]) if problem else not found.problems
 
 
+def test_points_beside_a_sync_source_on_the_network_are_not_compared(tmp_path: Path) -> None:
+    recorded, now = Talk(), Talk()
+    for talk, parked in ((recorded, b"from here"), (now, b"from there")):
+        talk.add(1, "sync", "tcp", b"POST").add(2, "scanner", "02", b"one").add(3, "scanner", "02", parked)
+    found = check_control(
+        recorded.write(tmp_path / "recorded.jsonl"),
+        now.write(tmp_path / "now.jsonl"),
+        devices=DEVICES,
+        tolerance_s=2e-3,
+    )
+    assert (found.problems, found.swaps) == ((), 0)
+
+
 def with_program(program: bytes) -> Talk:
     now = scan()
     now.lines = [(*line[:4], program) if line[4].startswith(b"\x01\x0a") else line for line in now.lines]
