@@ -232,7 +232,7 @@ def test_a_program_that_may_not_have_arrived_whole_is_never_run(line: int) -> No
             device.run()
 
 
-def test_a_board_that_hangs_or_is_unplugged_is_not_taken_for_dark() -> None:
+def test_a_board_that_hangs_or_is_unplugged_is_not_taken_for_dark(caplog: pytest.LogCaptureFixture) -> None:
     with teensy() as wire:
         device = wire.open()
         device.program(LIT, 1)
@@ -247,9 +247,11 @@ def test_a_board_that_hangs_or_is_unplugged_is_not_taken_for_dark() -> None:
         assert (wire.pins, wire.model.why) == (0, "watchdog")
         wire.server.unplug()
         assert device.port_lost
-        for verb in (lambda: device.status, device.abort, device.close):
+        for verb in (lambda: device.status, device.abort):
             with pytest.raises(DeviceDisconnected, match="plug it in again"):
                 verb()
+        device.close()
+        assert "could not be left safe" in caplog.text
 
 
 # Light

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceDisconnected, DeviceFault, LimitExceeded, WrongState
+from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, LimitExceeded, WrongState
 from drivers.interfaces import (
     OUT_GATE,
     BurstMode,
@@ -63,15 +63,18 @@ class TroubledLaser(LineLaser):
         self.calls.append("close")
 
 
-@pytest.mark.parametrize("fails", [False, True])
-def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off(fails: bool) -> None:
-    laser = TroubledLaser(pause_error=DeviceDisconnected("lamp: unplugged") if fails else None)
+@pytest.mark.parametrize("error", [None, DeviceFault("lamp: stuck"), DeviceDisconnected("lamp: unplugged")])
+def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off(
+    error: DeviceError | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    laser = TroubledLaser(pause_error=error)
     laser.arm(0.01)
-    with pytest.raises(DeviceDisconnected, match="unplugged") if fails else nullcontext():
+    with pytest.raises(type(error)) if error else nullcontext():
         laser.pause()
-    assert laser.state is (DeviceState.RUNNING if fails else DeviceState.CONFIGURED)
-    with pytest.raises(DeviceDisconnected, match="unplugged") if fails else nullcontext():
+    assert laser.state is (DeviceState.RUNNING if error else DeviceState.CONFIGURED)
+    with pytest.raises(DeviceFault, match="stuck") if isinstance(error, DeviceFault) else nullcontext():
         laser.close()
+    assert ("could not be left safe" in caplog.text) is isinstance(error, DeviceDisconnected)
     laser.close()
     assert laser.calls == ["arm 0.01", "pause", "pause", "close"]
     assert laser.state is DeviceState.CLOSED
