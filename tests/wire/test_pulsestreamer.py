@@ -39,7 +39,7 @@ from drivers.sync.pulsestreamer_sequence import (
     compile_sequence,
 )
 from tests.wire.faults import Fault, FaultScript
-from tests.wire.lasers import eventually
+from tests.wire.lasers import PATIENCE_S, eventually
 from tests.wire.syncs import PulseBox, pulse_box
 
 WAIT, GATE, DARK = Pulse(0, None), Pulse(OUT_GATE, 5e-3), Pulse(0, 1e-3)
@@ -198,7 +198,8 @@ def test_an_abort_of_another_thread_meanwhile_is_the_last_word(step: str) -> Non
             with suppress(DeviceFault):  # the next run may be on its way when it reads the outputs back
                 device.abort()
 
-        lowered, threads = threading.Event(), [threading.Thread(target=abort)]
+        lowered, aborting = threading.Event(), threading.Thread(target=abort)
+        threads = [aborting]
 
         def before(method: str) -> None:
             if method == step and threads:
@@ -217,6 +218,7 @@ def test_an_abort_of_another_thread_meanwhile_is_the_last_word(step: str) -> Non
         with pytest.raises(WrongState, match="interrupted by abort"):
             device.run()
         assert lowered.is_set()
+        aborting.join(PATIENCE_S)
         since_s = box.now_s
         box.clock.sleep(1.0)
         eventually(lambda: not box.pins)
