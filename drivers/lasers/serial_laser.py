@@ -57,7 +57,7 @@ class _Light:
     may_shine = False
 
 
-_OFF_TIMES = 3
+OFF_TIMES = 3
 """Number of times that the bytes that switch off are sent: the first may end a command that was cut short, and the
 second may come too soon after a reply to be heard."""
 
@@ -69,7 +69,7 @@ def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: 
         return
     if light.may_shine:
         try:
-            port.write_again(off, _OFF_TIMES)
+            port.write_again(off, OFF_TIMES)
             _log.warning("%s: was left armed; it was told to switch off", name)
         except DeviceError as error:
             _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)

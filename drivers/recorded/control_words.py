@@ -53,10 +53,8 @@ class Spoken:
                 sent[one.device, one.port].append(one)
         commands: dict[str, list[Passed]] = {}
         buffers: list[Passed] = []
-        networked: set[str] = set()
         for (device, port), words in sent.items():
             if port == _NETWORK:
-                networked.add(device)
                 continue
             if port in FRAME_PORTS:
                 buffers += words
@@ -65,7 +63,7 @@ class Spoken:
                 said = _once(_lines(words)) if port == _SERIAL else [one for one in words if one.data[0] not in asked]
                 commands.setdefault(device, []).extend(said)
         # Without the commands of the sync source nobody knows which buffers are a scan's.
-        return cls(commands, [] if "sync" in networked else _scans(commands.get("sync"), buffers))
+        return cls(commands, [] if ("sync", _NETWORK) in sent else _scans(commands.get("sync"), buffers))
 
 
 def _lines(pieces: list[Passed]) -> list[Passed]:

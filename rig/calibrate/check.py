@@ -1,6 +1,5 @@
 """`rig calibrate check`: judges a calibration by views of a flat board from which it was not made."""
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,19 +15,17 @@ from calibration.diagnosis.verdicts import goal, judge_check
 from calibration.errors import Degenerate, mm
 from calibration.files.rig_file import CORNERS, corners_digest, load_rig_model
 from calibration.model.rig_model import RigModel
-from calibration.verdict import AccuracyGoal, Verdict
+from calibration.verdict import AccuracyGoal
 from calibration.views import View
 from rig.calibrate.capture import AskPerson, TellLine, require_live
 from rig.calibrate.report import check_report
 from rig.calibrate.session import CalibrationResult, Session, true_errors, truth_content
 from rig.calibrate.sources import SourcesLike, si_values, sort_sources
 from rig.calibrate.views import good_poses, note_views, take_kept, take_live
-from rig.devices.calibration_use import note_check
+from rig.devices.calibration_use import try_note
 from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.requests import CheckRequest
-
-_log = logging.getLogger(__name__)
 
 _BOARD_KEYS = (
     "distance_m", "flatness_rms_m", "flatness_peak_m", "expected_m", "chi2", "freedom", "scale", "scale_sd",
@@ -83,7 +80,7 @@ def calibrate_check(
         uncertainty = None if model.covariance is None else depth_uncertainty(model, wanted.at_m)
         line = NO_COVARIANCE if uncertainty is None else uncertainty.line()
         refused = not verdict.passed and model.identity is not None
-        noted = model.identity is None or _noted(file, model, verdict)
+        noted = model.identity is None or try_note(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
         consequence = _consequence(file, noted=noted) if refused else []
         summary = {
             "verdict": verdict.as_json(),
@@ -137,16 +134,6 @@ def _summary(
             "line": None if uncertainty is None else uncertainty.line(),
         },
     }
-
-
-def _noted(file: Path, model: RigModel, verdict: Verdict) -> bool:
-    """Note the check beside the calibration; returns whether that could be done."""
-    try:
-        note_check(file, model, "check", passed=verdict.passed, reasons=verdict.codes)
-    except OSError as error:
-        _log.warning("%s cannot be noted on: %s", file, error.strerror or error)
-        return False
-    return True
 
 
 def _consequence(file: Path, *, noted: bool) -> list[tuple[str, str]]:

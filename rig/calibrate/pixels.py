@@ -8,7 +8,6 @@ The folder has pixels.npz (the map with its version), calibration.yaml (that of 
 and dark rates), dark_rate.png, report.html and summary.json. The statistics are in `calibration.pixel_map`.
 """
 
-import logging
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -36,7 +35,7 @@ from rig.config.models import RigConfig, ScanConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure
 from rig.count.sweeps import SweepData
 from rig.count.volume import BIN_DARK, CountVolume, SweepCounter, SweepLayout
-from rig.devices.calibration_use import carry_notes, note_check
+from rig.devices.calibration_use import carry_notes, try_note
 from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.errors import UsageError
 from rig.geometry.windows import WORD_PX
@@ -298,8 +297,6 @@ def _drift_rows(drift: pixel_map.PixelDrift, against: pixel_map.PixelVersion) ->
     ]  # fmt: skip
 
 
-_log = logging.getLogger(__name__)
-
 PIXELS_FILE: Final = "pixels.npz"
 LIT_FRAMES: Final = 100
 """Frames taken with the line on each pixel: enough to judge a pixel that should fire in a third of them."""
@@ -395,11 +392,9 @@ def _note(config: RigConfig, drift: pixel_map.PixelDrift) -> None:
     assert config.calibration is not None, "the older map lies beside it"
     try:
         model = load_rig_model(config.calibration)
-        note_check(config.calibration, model, "pixels", passed=not drift.reasons, reasons=drift.reasons)
+        try_note(config.calibration, model, "pixels", passed=not drift.reasons, reasons=drift.reasons)
     except CalibrationError as error:
         raise UsageError(f"calibration: {error}") from error
-    except OSError as error:
-        _log.warning("%s cannot be noted on: %s", config.calibration, error.strerror or error)
 
 
 def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -> PixelResult:

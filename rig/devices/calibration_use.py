@@ -11,6 +11,7 @@ file beside the calibration (`note_check`, `notes_on`); the calibration itself s
 
 import hashlib
 import json
+import logging
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -25,6 +26,8 @@ from rig.devices.open import OpenRig
 from rig.errors import UsageError
 from rig.run_folder.folder import replace_file
 from rig.run_folder.manifest import read_manifest
+
+_log = logging.getLogger(__name__)
 
 NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
 
@@ -275,6 +278,16 @@ def note_check(file: Path, model: RigModel, what: str, *, passed: bool, reasons:
     notes[what] = {"calibration": model.fingerprint(), "date": date, "passed": passed, "reasons": list(reasons)}
     replace_file(beside, (json.dumps(notes, indent=1) + "\n").encode())
     return beside
+
+
+def try_note(file: Path, model: RigModel, what: str, *, passed: bool, reasons: tuple[str, ...] = ()) -> bool:
+    """Note a check as `note_check` does; returns False, and logs a warning, if the file cannot be written."""
+    try:
+        note_check(file, model, what, passed=passed, reasons=reasons)
+    except OSError as error:
+        _log.warning("%s cannot be noted on: %s", file, error.strerror or error)
+        return False
+    return True
 
 
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:

@@ -15,6 +15,7 @@ from drivers.clock import Clock, SystemClock, VirtualClock
 from drivers.errors import DeviceError, DeviceTimeout, NoAnswer, ProtocolError
 from drivers.guard import Guard
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
+from drivers.lasers.serial_laser import OFF_TIMES
 from drivers.registry import KindConfig, Surroundings, lookup
 from drivers.transports.endpoints import EMULATED_PREFIX, Endpoint
 from drivers.transports.serial_port import configured_port
@@ -23,8 +24,6 @@ from rig.config.models import RigConfig
 from rig.errors import DevicesError, UsageError
 from rig.recording.cube import cube_columns
 
-_OFF_TIMES = 3
-"""Number of times that a laser which does not answer is told to switch off."""
 GUARDED = ("laser", "sync")
 """Slots of the devices that let light out. If they are real, a separate process (the guard) owns them."""
 DEVICES = ("spad", "scanner", "laser", "sync")
@@ -111,7 +110,7 @@ def _told_off(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
         return ""
     try:
         with closing(configured_port(slot, config, surroundings.ports)) as port:
-            port.write_again(kind.off(config), _OFF_TIMES)
+            port.write_again(kind.off(config), OFF_TIMES)
     except Exception:
         return ""  # the first error says what is wrong
     return " (it was told to switch off all the same; look whether it is dark)"

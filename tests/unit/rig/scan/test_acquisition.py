@@ -164,6 +164,20 @@ def test_the_gate_goes_low_on_the_thread_of_a_scanner_that_fails():
     assert log == [*START, "sync.gate_low", "noticed", *STOP]
 
 
+def test_a_gate_that_does_not_go_low_has_the_laser_paused_on_that_thread():
+    def fails(seq):
+        if seq == 2:
+            rig.sync.gate_low = lambda: (_ for _ in ()).throw(DeviceTimeout("sync: no answer"))
+            rig.scanner.on_fault()
+            log.append("noticed")
+            rig.scanner.fault = "scanner: the points ran dry"
+
+    rig, log = rig_of(5, behaviour=fails)
+    with pytest.raises(DeviceFault, match="ran dry"):
+        list(acquisition(rig, PLAN, 5).run())
+    assert log == [*START, "laser.pause", "noticed", *STOP]
+
+
 @pytest.mark.parametrize("unplugged", [False, True])
 def test_maps_that_are_whole_when_the_scanner_stops_early_are_still_given(unplugged):
     rig, log = rig_of(5)
