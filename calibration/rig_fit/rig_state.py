@@ -221,6 +221,8 @@ def _moved(pose: BoardPose, change: Array) -> BoardPose:
 
 _ORDERS = (3, 1, 3)
 """Orders of d, b and e in the command: enough for tangents of angles from -22.5 to 22.5 degrees."""
+BOARDS_FOR_PLANES = 2
+"""Fewest boards at one speed for a lag: one board shows a line of each plane, which fits any plane through it."""
 POSES_FOR_PLANES = 5
 """Fewest boards at one speed for planes: on fewer boards, a command's light gives too few lines for a good plane."""
 MOST_FIRST_LAG_S = 1e-3
@@ -274,17 +276,22 @@ def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tupl
     velocities = np.unique(points.velocity_per_s)
     shown = np.array([np.unique(points.view[points.velocity_per_s == velocity]).size for velocity in velocities])
     velocities = velocities[shown >= min(POSES_FOR_PLANES, int(shown.max()))]
-    counts = [np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities]
-    swept = [_planes_of(points, velocity) for velocity in velocities]
-    axis, point, first = _pivot(swept[int(np.argmax(counts))][1])
-    curves = [(commands, _angles(planes, axis, first)) for commands, planes in swept]
-    lags = np.clip(_lags(velocities, curves), 0.0, MOST_FIRST_LAG_S)
+    lags = _first_lags(points, velocities) if shown.max() >= BOARDS_FOR_PLANES else np.zeros(2)
     mirror = points.command - points.velocity_per_s * np.where(points.velocity_per_s > 0, lags[0], lags[1])
     one = LitPoints(points.points_m, mirror, np.ones_like(mirror), points.view)
     commands, planes = _planes_of(one, 1.0)
     axis, point, first = _pivot(planes)
     angle: Array = polynomial.polyfit(commands, _angles(planes, axis, first), 1).astype(np.float64)
     return PivotScanner(point, axis, first, angle, command_range), np.array([*lags, 0.0])
+
+
+def _first_lags(points: LitPoints, velocities: Array) -> Array:
+    """(lag forward, lag backward), from the planes that the sweeps at these signed speeds give one by one."""
+    counts = [np.count_nonzero(points.velocity_per_s == velocity) for velocity in velocities]
+    swept = [_planes_of(points, velocity) for velocity in velocities]
+    axis, _, first = _pivot(swept[int(np.argmax(counts))][1])
+    curves = [(commands, _angles(planes, axis, first)) for commands, planes in swept]
+    return np.clip(_lags(velocities, curves), 0.0, MOST_FIRST_LAG_S)
 
 
 def _planes_of(points: LitPoints, velocity: float) -> tuple[Array, Array]:

@@ -143,6 +143,24 @@ def test_one_direction_at_one_speed_leaves_the_lag_as_it_was() -> None:
     assert again.model.lag_s == (0, 0)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_boards_that_share_no_speed_tell_no_first_lag(seed: int) -> None:
+    """One board at a speed fits any lag, and a start from such lags depended on the last digits of the corners."""
+    rng = np.random.default_rng(seed)
+    poses = [data.random_pose(rng, data.RIG) for _ in range(3)]
+    seen = [
+        data.seen_view(rng, data.RIG, *pose, data.SEEN, (30.0 + 9 * i, -30.0 - 9 * i)) for i, pose in enumerate(poses)
+    ]
+    camera = data.true_camera(data.RIG)
+    first = []
+    for view in seen:
+        assert view.corners is not None
+        first.append(rig_state.first_pose(camera, data.BOARD.corners_m[view.corners.ids], view.corners.px))
+    sightings = [sighting(view, data.BOARD, camera, pose) for view, pose in zip(seen, first, strict=True)]
+    _, timing = rig_state.first_scanner(rig_state.board_points(camera, sightings, first), (-1.0, 1.0))
+    assert timing.tolist() == [0.0, 0.0, 0.0]
+
+
 def test_what_other_pictures_told_of_the_camera_counts() -> None:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     known = Covariance(names, np.diag(np.array([0.05, 0.05, 0.05, 0.05, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4]) ** 2))
