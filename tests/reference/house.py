@@ -28,7 +28,10 @@ LIMITS: Mapping[str, tuple[str, int]] = {
     "median": ("at least", 130),
     "folder": ("at most", 12),
     "circles": ("at most", 0),
+    "parameters": ("at most", 0),
+    "docstrings": ("at most", 0),
     "missing": ("at most", 0),
+    "same-classes": ("at most", 0),
     "tests": ("at most", 38_000),
 }
 GOALS = ("lines", "tests")
@@ -254,7 +257,7 @@ def circles_of(graph: Graph) -> list[list[str]]:
 
 
 def parameter_figure(modules: Sequence[Module]) -> Figure:
-    """Functions with ten parameters or more."""
+    """Functions with ten parameters or more. The value is the number of those that are public and not compiled."""
     items, public = [], 0
     for module in modules:
         for path, node in definitions(module.tree):
@@ -266,7 +269,7 @@ def parameter_figure(modules: Sequence[Module]) -> Figure:
             kind = "compiled" if compiled else "public" if outside else "private"
             items.append(f"{module.name}.{'.'.join(path)}: {n}, {kind}")
     told = f"{len(items)} functions with {MANY_PARAMETERS} or more parameters, {public} of them public and not compiled"
-    return Figure("parameters", len(items), told, sorted(items))
+    return Figure("parameters", public, told, sorted(items))
 
 
 def parameters(node: Function) -> int:

@@ -133,6 +133,7 @@ def test_functions_of_many_parameters_are_told_apart(tree: Path) -> None:
     assert parameters.items == [
         "rig.scan._add: 10, private", "rig.scan.add: 10, compiled", "rig.scan.start: 10, public",
     ]  # fmt: skip
+    assert parameters.value == 1
     assert parameters.told == "3 functions with 10 or more parameters, 1 of them public and not compiled"
 
 
@@ -158,7 +159,10 @@ def test_limits_decide_the_exit_code_and_goals_are_only_told(
     assert house.main(["--root", str(tree)]) == 0
     assert house.main(["--root", str(tree), "--limits"]) == 1
     assert [line for line in capsys.readouterr().out.splitlines() if "should be" in line] == [
-        "broken: median is 5, it should be at least 130: short by 125"
+        "broken: median is 5, it should be at least 130: short by 125",
+        "broken: parameters is 1, it should be at most 0: short by 1",
+        "broken: docstrings is 3, it should be at most 0: short by 3",
+        "broken: same-classes is 1, it should be at most 0: short by 1",
     ]
     lines = int(found(tree)["lines"].value)
     monkeypatch.setattr(house, "LIMITS", {"lines": ("at most", 10), "tests": ("at most", 2)})
