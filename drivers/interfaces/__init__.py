@@ -1,4 +1,8 @@
-"""The interfaces of all devices, one file each. The application uses devices only through them."""
+"""The interfaces of all devices, one file each. The application uses devices only through them.
+
+Input: a power (`LineLaser`), a waveform (`BeamScanner`), pulses of the gate (`SyncSource`), a request for frames
+(`SpadArray`). Output: blocks of frames in a ring, and the limits and the status that each device reports.
+"""
 
 from drivers.interfaces.device import Device as Device
 from drivers.interfaces.device import DeviceState as DeviceState

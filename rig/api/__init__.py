@@ -4,12 +4,14 @@ from rig.api import scan
 result = scan(exposures=4, seed=1)
 result.last.depth_m, result.summary.truth
 
-For a calibration, `sources` may be a rig (a config, its file, or the name of a bundled rig), folders of runs taken with
-`record`, folders of earlier calibrations (for their views) and, for `calibrate_camera`, pictures. The default is the
-bundled simulated rig, which moves the board itself. With a real rig, `ask` is called when the board must be moved, and
-must return once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError if the views
-give no calibration (its subclass Degenerate, with `.reason`, if more or other views would help), UsageError for a
-request that cannot be met, and DeviceError or DevicesError if devices fail. Views taken before the error are in `out`.
+Input: a config or a run's folder, and a request or its fields by name. Output: a result object, and the files that the
+command writes. For a calibration, `sources` may be a rig (a config, its file, or the name of a bundled rig), folders of
+runs taken with `record`, folders of earlier calibrations (for their views) and, for `calibrate_camera`, pictures. The
+default is the bundled simulated rig, which moves the board itself. With a real rig, `ask` is called when the board must
+be moved, and must return once that is done; `tell` gets a line about each view. All calibrations raise CalibrationError
+if the views give no calibration (its subclass Degenerate, with `.reason`, if more or other views would help),
+UsageError for a request that cannot be met, and DeviceError or DevicesError if devices fail. Views taken before the
+error are in `out`.
 """
 
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up

@@ -1,6 +1,7 @@
 """Vector operations for compiled kernels: sixteen lanes of 8, 16 or 32 bits, written as LLVM instructions.
 
-This module defines short names for the arrays that kernels take.
+Input: vectors, or addresses of arrays. Output: vectors, or numbers in memory. Vectors exist only in compiled code. This
+module defines short names for the arrays that kernels take.
 """
 
 import numpy as np
