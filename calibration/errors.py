@@ -1,6 +1,4 @@
-"""The errors of this package, and numbers in messages and tables: with a few digits and, except for condition numbers,
-without powers of ten.
-"""
+"""The errors of this package, and numbers in messages: few digits and, but for condition numbers, no powers of ten."""
 
 import numpy as np
 

@@ -6,7 +6,7 @@ no state and no order (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as 
 last one mixes columns too, a bijection). Its 128 bits are the key of a few rows of a frame, under which `drawn_word`
 enciphers the numbers of blocks of 8 pixels with three more rounds. Block numbers of one key differ in a few bytes,
 which two rounds spread over all 16; after the third, bytes of two blocks agree as often as by chance, within 1e-7.
-Single numbers that follow from a seed and a count use SplitMix64 (Steele, Lea, Flood 2014).
+Single numbers that follow from a seed and a count use SplitMix64 (Steele, Lea, Flood 2014). All are uint64.
 
 One AES round of 256 bits takes one cycle on x86 with VAES, two with AES-NI or on 64-bit ARM. Elsewhere table look-ups
 give the same bits, many times as slowly.

@@ -1,5 +1,4 @@
-"""Locates corners to a few hundredths of a pixel by matching the board, drawn as it should look around each, to the
-picture.
+"""Locates corners to a few hundredths of a pixel: the board, drawn as it should look there, is matched to the picture.
 
 A smooth map leads from the board to the picture: a homography and, if there are enough points, a polynomial for the
 distortion of the lens. The map needs no camera model. It is fitted to points whose board positions are known, and tells

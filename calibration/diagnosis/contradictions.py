@@ -1,5 +1,4 @@
-"""Contradictions that a single unmoved rig cannot produce: differences between sweeps (waves), and shifts between
-views.
+"""Contradictions that a single unmoved rig cannot produce: waves (sweeps that differ), and shifts between views.
 
 It is assumed that nothing moved during the sweeps of a view. So their residuals, binned over the mirror's command, may
 differ only by noise and by one constant for each direction (the remaining error of the lag). All other differences are

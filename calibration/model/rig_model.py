@@ -1,5 +1,4 @@
-"""The rig model: the calibrated camera and scanner, other known properties of the rig, and the parameters'
-covariance."""
+"""The rig model: calibrated camera and scanner, other known properties of the rig, and the parameters' covariance."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,4 @@
-"""A dialogue with a device that answers one command at a time: paced, checked, and synchronised again after a lost
-reply.
+"""A dialogue with a device that answers one command at a time: paced, checked, and synchronised after a lost reply.
 
 Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, Lasers on a serial line), so a late one
 would be taken for the answer to the next command. Therefore the input is dropped before each command, and each reply

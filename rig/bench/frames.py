@@ -2,8 +2,12 @@
 
 Haze falls off with distance and drops to a tenth at a stripe. Position and brightness of the stripe are drawn anew for
 every row and every `PLACE_FRAMES` frames, which are called a place. The light is that of the working point `report`
-(docs/results/README.md). Stages that make complete maps use a single surface instead, as frames of a sweep and as a
-pair of pictures with the same disparities.
+(docs/results/README.md). A pixel fires if a random number of 16 bits is below its threshold, uint32 (rows, window),
+
+    threshold = 2^16 (1 - exp(-flux)),    flux = haze + ambient light + line
+
+and its bit is in frames uint8 (frames, rows, window / 8). Stages that make complete maps use a single surface instead,
+as frames of a sweep and as a pair of pictures with the same disparities.
 """
 
 from dataclasses import dataclass

@@ -1,5 +1,4 @@
-"""Plays a long stream from memory, at the sensor's rate, through the acquisition of `rig scan`, to see what is lost and
-what grows.
+"""Plays a long stream at the sensor's rate through the acquisition of `rig scan`, to see what is lost and what grows.
 
 The bundled simulated rig records a few sweeps, once. A SPAD that cannot wait plays them in real time, with running
 frame numbers. Everything else is as in a scan: ring, binding, counting, estimation, maps, a monitor, and the overload

@@ -1,5 +1,4 @@
-"""`rig calibrate sync`: lag of the mirror in each direction and delay of the rows, from one unmoved scene at several
-speeds.
+"""`rig calibrate sync`: the mirror's lags and the delay of the rows, from one unmoved scene at several speeds.
 
 `calibrate_sync` measures them. `gate_delay` measures how much later than the gate the light comes and goes, from the
 frames of a recorded run at both ends of its sweeps. The plan says when the gate opens and closes after the scan marker;

@@ -1,7 +1,12 @@
 """Compiled walk along the records of a block, which gives every frame its sweep, column and bin.
 
-It goes frame by frame, because the place of a frame depends on the frames before it. Its state is kept in one record
-(`CARRIED` in `rig.count.bind`), so that it continues in the next block.
+With p the scanner's points from the sweep's scan marker to the middle of a frame's exposure, by the latest marker,
+
+    column = (p / point_rate_hz - lit_start_s) / column_s - 1/2,    counted from the other end if columns fall
+
+Columns are float64, sweeps and bins int32, all (frames,). The walk goes frame by frame, because the place of a frame
+depends on the frames before it. Its state is kept in one record (`CARRIED` in `rig.count.bind`), so that it continues
+in the next block.
 """
 
 from typing import Any, Final

@@ -1,5 +1,4 @@
-"""From stripe positions to depth: triangulation on the camera's grid, and the fog density that follows from a map's
-haze.
+"""From stripe positions to depth: triangulation on the camera's grid, and the density of the fog from its haze.
 
 Input: a stripe table and the geometry of the sweep. Output: depth in metres per camera pixel, and the extinction.
 """

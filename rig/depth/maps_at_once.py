@@ -1,5 +1,4 @@
-"""Makes the maps of counted sweeps, several at the same time where the estimator can, and delivers them in the order of
-the sweeps.
+"""Makes the maps of counted sweeps, several at once where the estimator can, and delivers them in the sweeps' order.
 
 A map made on one thread takes less time of all processors together than one that several threads share, since parts of
 it cannot be shared. So in a stream each thread makes a map of its own. The results are the same: an estimator says

@@ -1,5 +1,4 @@
-"""Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row, without knowledge of the
-medium.
+"""Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row. The medium is learned.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
 how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the

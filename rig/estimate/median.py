@@ -1,7 +1,9 @@
-"""Filter `median`: a 5x5 median, as in the report that this project follows, applied to disparity so that the slant of
-columns does not matter.
+"""Filter `median`: a 5x5 median of disparity, as in the report that this project follows.
 
-Disparity is x minus the position of the column's line at a fixed depth. Missing answers (NaN) are ignored, not filled.
+    answer = reference + median of (x - reference) over 5 x 5 rows and columns
+
+with reference the position of the column's line at a fixed depth, so that the slant of columns does not matter. Arrays
+are float32 (rows, columns). Missing answers (NaN) are ignored, not filled.
 """
 
 from dataclasses import replace

@@ -1,5 +1,4 @@
-"""Writes a run as one HDF5 file. h5py opens it, and so does MATLAB with `h5read` or, as a MAT-file of version 7.3,
-`load`.
+"""Writes a run as one HDF5 file. h5py opens it, and so does MATLAB with `h5read` or `load` (MAT-file of version 7.3).
 
     /frames/bits uint8 (frames, height, row bytes)  /frames/number run ticks time_s marks x0 y0 line sweep (1, frames)
     /maps/depth_m float32 (maps, height, width)  /maps/number (1, maps)  /manifest UTF-16 (n, 1)

@@ -1,9 +1,9 @@
 """Compiled geometry: the pixel interval of a depth range on a row, and the depth of pixels on bowed sheets.
 
 A pixel's ray is (u, v, 1); on a light plane p.X = 1 it has the inverse depth w = p.(u, v, 1) in 1/m. Along a row w is
-monotone, so `row_windows` finds both ends of an interval of w by bisection. `bent_inverse_depth` takes Newton's steps,
-starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64. u, v and inverse
-depth are float32 (rows, width).
+monotone, so `row_windows` finds both ends of an interval of w by bisection, int32 (rows,). `bent_inverse_depth` takes
+Newton's steps, starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64. u, v
+and inverse depth are float32 (rows, width).
 """
 
 from typing import Final

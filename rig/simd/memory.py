@@ -3,9 +3,10 @@
 Addresses are used instead of arrays because numba counts references to every array that a compiled function gets. In
 the functions for one image row the counting takes many times as long as the work itself. So a caller makes a named
 tuple of arrays, keeps it alive and passes its `pointers`; inside a kernel `address_of` gives the address of an array,
-and `keep_alive` keeps one that the kernel itself has allocated.
-Nothing here checks that an index lies inside the array. In an array that begins at a cache line (`aligned_zeros`), a
-vector of 32 bytes at a multiple of 32 bytes lies in one cache line, so that one line is read for it, not two.
+and `keep_alive` keeps one that the kernel itself has allocated. Item i of an array is at address + i x (bytes of an
+item), and nothing here checks that it lies inside the array. The names say the type of the items. In an array that
+begins at a cache line (`aligned_zeros`), a vector of 32 bytes at a multiple of 32 bytes lies in one cache line, so that
+one line is read for it, not two.
 """
 
 from typing import Any, Final, TypeVar

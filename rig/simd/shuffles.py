@@ -1,5 +1,6 @@
-"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, transposed blocks of
-numbers.
+"""Operations across lanes: shuffles, sums along the lanes, masks with a bit for each lane, transposed blocks.
+
+There is no formula: each operation says what lane i gets. Vectors are 16 int16 or float32, 32 or 128 bytes.
 
 Reductions (`largest_of_rows`, `totals_of_rows`) take LANES rows at once and give one number per row, which becomes one
 lane of the result. If they went row by row, every step would wait for the one before. `fetch_eights` and

@@ -1,5 +1,4 @@
-"""Lists the physical effects that a simulated scene calls for, as its world reports them, and measures how much each
-matters."""
+"""Lists the effects that a simulated scene calls for, as its world reports them, and measures how much each matters."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager

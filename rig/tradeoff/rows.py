@@ -1,5 +1,4 @@
-"""The rows of a trade-off: error and time of a setting, with a confidence interval, and whether another setting is
-better.
+"""The rows of a trade-off: error and time of a setting, their confidence interval, and whether another one is better.
 
 `score_map` makes the row of one map, `over_repeats` that of several, `with_fronts` marks the Pareto fronts.
 

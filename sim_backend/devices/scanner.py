@@ -1,5 +1,4 @@
-"""The simulated galvanometer. It plays a waveform on its own, slightly wrong clock; the mirror lags behind the
-command."""
+"""The simulated galvanometer. Its clock is slightly wrong, and its mirror lags behind the command."""
 
 import math
 from fractions import Fraction

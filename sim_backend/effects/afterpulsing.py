@@ -15,8 +15,8 @@ detection there falls into the blind part with probability
 
 If the pixel's bit is 1, these are the chances that its next bit is set or cleared: 5e-5 each with a = 0.5 %,
 tau = d = 100 ns and frames of 10 us without a gap. Later exposures, and afterpulses of afterpulses, are left out. Bits
-change with exactly these chances. Cost per frame of 512 x 512: 0.8 us at these figures. The simulated SPAD also draws
-the last frame of each gap: it is not received, but affects the next frame.
+change with exactly these chances, in frames uint64 (frames, rows, words). Cost per frame of 512 x 512: 0.8 us at these
+figures. The simulated SPAD also draws the last frame of each gap: it is not received, but affects the next frame.
 """
 
 import math

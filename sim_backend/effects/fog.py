@@ -14,9 +14,9 @@ blurred by `sigma_px`. The haze is simulated if the scene has a `medium`.
 
 Along a row the loop over lit pixels has no branches, so it becomes vector instructions; only the pixels under the
 blurred end are done one by one. Cost per mirror position for 512 x 512 pixels, half of them lit: 0.36 ms in float64,
-0.19 ms in float32. Kernels use the precision of the array they add to. In float32 the haze is right to 1e-5 at an
-optical depth of 10. For a row in one column this makes the divergence eps of `sim_backend.effect_planner` 1e-8; 2e-4 is
-allowed.
+0.19 ms in float32. Kernels use the precision of `rate` (rows, width), to which they add. In float32 the haze is right
+to 1e-5 at an optical depth of 10. For a row in one column this makes the divergence eps of `sim_backend.effect_planner`
+1e-8; 2e-4 is allowed.
 """
 
 import math

@@ -1,10 +1,13 @@
 """Light that the medium scatters more than once: a halo around the stripe, and a pedestal under the whole row.
 
-`sim_backend.effects.beam_spread` has the physics. It gives the halo as a share of the ballistic stripe, and the spread
-haze as a share of the haze at its end. Both depend on the angle from that end and on the optical depth t, which is half
-that of the light's whole way. Tables are made once for the medium and the rig (0.1 to 0.3 s). Between depths they are
-interpolated as shares of e^(2 t) - 1 and e^(1.5 t) - 1, which change little. Angles become pixels as in the middle of
-the picture. Light that is turned only a little (`forward_share`) counts as not scattered; it blurs the stripe itself.
+`sim_backend.effects.beam_spread` has the physics. With S the light of the ballistic stripe, less if the beam slants, H
+that of the haze at its end, and t half the optical depth of the light's whole way, a pixel x px from that end gets
+
+    S (e^(2 t) - 1) halo(t, x) + H (e^(1.5 t) - 1) haze(t, x)
+
+from tables float32 (depths, pixels), which change little with t and are made once for the medium and the rig (0.1 to
+0.3 s). Angles become pixels as in the middle of the picture. `rate`, to which light is added, is (rows, width). Light
+that is turned only a little (`forward_share`) counts as not scattered; it blurs the stripe itself.
 
 Against traced rows, levels in the ten pixels before and behind the stripe are right within 10 % up to an optical depth
 of 1 and within 20 % at 2 (docs/results/simulator.md). Cost: about 0.2 ms per mirror position for 512 x 512 pixels.

@@ -6,10 +6,14 @@ from the beam, next to nothing below 20 m, is in the extinction of stripe and ha
 albedo 0.9 with 4.5 times its melted cross-section. Seen from the side it is lit from, it sends back 8/3 of the mean
 over all directions, which is 8.6 times the light of a drop of equal melted diameter.
 
-A particle at X, r from the mirror, lies s = n.X - d off the middle of the sheet, whose profile N is Gaussian. It gets
-J/r N(s; sd) W/m^2 with J = P/fan and sd^2 = (thickness/4)^2 + (r spread/4)^2. This times its `back_m2_per_sr` is the
-intensity I that it sends back: a pixel of solid angle w sees the radiance I/(|X|^2 w). The point is blurred like the
-line, and drawn as a streak of the length that the particle falls in `HOLD_S`.
+A particle at X, r from the mirror, lies s = n.X - d off the middle of the sheet, whose profile N is Gaussian with
+sd^2 = (thickness/4)^2 + (r spread/4)^2. With J = P/fan, the extinction sigma and b its `back_m2_per_sr` (the intensity
+that it sends back over the irradiance that it gets), a pixel of solid angle w sees the radiance
+
+    J/r N(s; sd) b / (|X|^2 w) exp(-sigma (r + |X|))          W/(m^2 sr)
+
+The point is blurred like the line, and drawn as a streak of the length that the particle falls in `HOLD_S`. Arrays of
+particles are float64 (particles,) or (particles, 2); the light is added to `rate` (rows, width).
 
 The particles are a fixed set in the cone that the camera sees. Each keeps its depth; its direction moves with its speed
 and re-enters at the other side of the cone. So they are spread evenly at any time, and the time alone determines where

@@ -1,13 +1,15 @@
 """Speckle: laser light comes back grainy from a rough surface; a pixel averages the grains it covers.
 
-The light of M independent grains is gamma distributed with mean 1 and contrast (standard deviation over mean)
-1/sqrt(M). Behind an f-number N a grain has the area a = (4/pi) (wavelength N)^2. A diode of area A covers 1 + A/a
-grains; M is twice that, since a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2
-and 4.6). With the default sensor at f/2 the contrast is 0.15.
+The light of M independent grains is gamma distributed with mean 1. Behind an f-number N, for a diode of area A,
 
-Acts on the stripe, the light added before this effect. The grains depend on the pixel and on the position of the sheet
-in steps of the line's width, so they stay for all exposures of a column and return in every sweep. Cost: about 0.4 ms
-per mirror position for 512 rows.
+    contrast = sd / mean = 1 / sqrt(M),    M = 2 (1 + A / a),    a = (4/pi) (wavelength N)^2, the area of a grain
+
+with the factor 2 since a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and
+4.6). With the default sensor at f/2 the contrast is 0.15.
+
+Multiplies the stripe, the light that earlier effects added to `rate` (rows, width). The grains depend on the pixel and
+the position of the sheet in steps of the line's width, so they stay for all exposures of a column and return in every
+sweep. Cost: about 0.4 ms per mirror position for 512 rows.
 """
 
 import math

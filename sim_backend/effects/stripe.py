@@ -19,7 +19,8 @@ coefficient sigma_s. So the extra light is exp(t) - 1 times the ballistic light.
 deviation s per axis, at the share x of the way to the surface or back, shifts the light by (1 - x) of the angle: a
 variance of s^2/3 on average over x. Light that was turned at all was turned t / (1 - exp(-t)) times on average. The
 blur is one Gaussian of the resulting variance (small-angle scattering as a random walk, Ishimaru, "Wave propagation and
-scattering in random media", 1978, chapter 13). Cost: about 0.5 ms per mirror position for 512 rows.
+scattering in random media", 1978, chapter 13). Light is computed in float64 and added to `rate` (rows, width), float64
+or float32. Cost: about 0.5 ms per mirror position for 512 rows.
 """
 
 import math

@@ -8,8 +8,8 @@ The rest of p comes from a second draw: each pixel is chosen with chance c = 3 x
 
 That interval is three levels wide. So levels may be computed in float32 while every p is exact to the last bit of a
 float64; 0 never fires and 1 always does. The highest 16-bit level stands for 2^16 itself: its pixels are 1 whatever the
-random number, so they are set afterwards. Random numbers depend only on seed, frame and pixel
-(`sim_backend.random_numbers`), not on windows, threads or blocks.
+random number, so they are set afterwards. Levels are int16 (rows, words, 64), frames uint64 (frames, rows, words).
+Random numbers depend only on seed, frame and pixel (`sim_backend.random_numbers`), not on windows, threads or blocks.
 
 Measured for 512 x 512 on one core: 12 us a frame, and 0.12 ms for new levels when half of the words are lit.
 """

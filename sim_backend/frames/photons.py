@@ -4,7 +4,7 @@ Consecutive frames with the same light (one mirror position, power and time) for
 traced, its flux summed and turned into levels (thresholds for random numbers, see `photon_kernels`), from which each
 frame is drawn. Rows are split over threads, each of which goes by itself through all spans of a block (or of one
 moment, if things move); steps work row by row, so the split does not matter. The sensor's effects on bits act on whole
-frames, and windows are cut out afterwards.
+frames, and windows are cut out afterwards. Flux is float32 (rows, width), frames uint8 (frames, rows, row bytes).
 Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
 on two (`python -m tests.benchmarks.simulator`).
 """

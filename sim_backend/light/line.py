@@ -16,7 +16,7 @@ f is in pixels in the second term (a sheet's 1/e^2 full width is 4 sigma; r is t
 depth) and in metres in c. c is the diameter in pixels of the disc that a lens of f-number N focused at z0 makes of a
 point (thin lens); a disc has a variance of c^2/16 along the row. Both terms are switched on by `optics: {focus: 3 m}`
 and `line: {spread: 1 mrad}`; without them the width is `sigma_px` at every depth. The haze's end is blurred by
-`sigma_px` alone.
+`sigma_px` alone. All numbers are float64.
 
 The blurred edge of a Gaussian, Phi(a), and its integral, a Phi(a) + phi(a), come from a table, three times as fast as
 erf and exp. The table is interpolated by cubic Hermite polynomials between values and slopes a 64th of a standard

@@ -6,10 +6,12 @@ other. Then each row has a plane of its own, for the mirror's position at the ro
 is the tangent at the place where the row sees the sheet.
 
 A compiled walk follows the light along each row and finds whether it ends as a stripe. Along a row with rays (u, v, 1)
-the sheet's inverse depth w(x) = n.(u, v, 1)/d falls in the direction in which its light travels outward. The walk
-starts at the edge of the picture where w is larger and ends where w falls below the surface's inverse depth. Spans of
-32 pixels in which even the least w lies before the nearest surface are skipped at once. Cost: about 0.05 ms for
-512 x 512 pixels, half of them lit.
+
+    w(x) = n.(u, v, 1) / d,    the sheet's inverse depth in 1/m,
+
+falls in the direction in which its light travels outward. The walk starts at the edge of the picture where w is larger
+and ends where w falls below the surface's inverse depth, float64 (rows, width) like u and v. Spans of 32 pixels in
+which even the least w lies before the nearest surface are skipped. Cost: about 0.05 ms for 512 x 512 pixels, half lit.
 """
 
 from dataclasses import dataclass, replace

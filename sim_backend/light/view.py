@@ -1,5 +1,4 @@
-"""The camera's view of a scene, pixel by pixel, as needed for tracing the light: rays, inverse depth, facets,
-albedo."""
+"""The camera's view of a scene, pixel by pixel, for tracing the light: rays, inverse depth, facets, albedo."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,9 +1,12 @@
 """Temporal prior of `joint`: where a surface was clear in the last map, labels far from it cost a little more.
 
-If the last map's label was b, the cost of a label l rises by min(SLOPE max(|l - b| - FREE, 0), c MOST), where c grows
-from 0 to 1 with the confidence of the last answer. MOST is far less than the cost of a jump between neighbours, and
-than the evidence of a stripe's photons. So where something has moved, the counts outweigh the prior. Only the last map
-is used: the prior does not grow from map to map.
+With b the last map's label of a row and column, the cost of a label l, uint8 (rows, columns, labels), rises by
+
+    min(SLOPE max(|l - b| - FREE, 0), c MOST)
+
+where c grows from 0 to 1 with the confidence of the last answer; b and c MOST are uint16 (2, rows, columns). MOST is
+far less than the cost of a jump between neighbours, and than the evidence of a stripe's photons. So where something has
+moved, the counts outweigh the prior. Only the last map is used: the prior does not grow from map to map.
 """
 
 import numba

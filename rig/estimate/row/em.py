@@ -3,9 +3,13 @@
 A line here is one row of one column; only 'line width' and 'laser line' mean the laser's. In each round every line's
 posterior P(j) over positions gives the probability that a pixel lies before or behind the stripe: pixel t lies before
 it if the stripe is farther, with probability sum over j > t of P(j). Ones and exposures are added with these weights
-per bin of path inverse depth (`learn_rows`). Haze, pedestal (the level behind the stripe), gains and amplitudes are
-then set from these float64 sums; the line width is found by trial (`fit_line_width`). Where data are few, haze is
-assumed to fall exponentially with the path length.
+per bin of path inverse depth (`learn_rows`), float64 (BINS, LEVELS). A bin's level of haze or pedestal (the level
+behind the stripe) is
+
+    level = (-log(1 - ones / exposures) - mean ambient flux) / mean G          G: see `rig.estimate.row.inputs`
+
+Gains and amplitudes follow from the sums, too; the line width is found by trial (`fit_line_width`). Where data are few,
+haze is assumed to fall exponentially with the path length.
 """
 
 from dataclasses import replace

@@ -15,8 +15,8 @@ counts of both look alike. Its neighbours can: on a surface their answers agree,
 - K: exposures. With more exposures, neighbouring rows place the end of a haze more alike.
 
 A, B, C and D are fitted by maximum likelihood to random scenes of the tests' simulator, at K = 1 to 30, with haze,
-ambient light and stripes of many strengths. Answers where there is no stripe count as wrong.
-docs/results/confidence.md says how far a confidence can be believed.
+ambient light and stripes of many strengths. Answers where there is no stripe count as wrong. Arrays are float32
+(rows, columns). docs/results/confidence.md says how far a confidence can be believed.
 """
 
 from dataclasses import replace

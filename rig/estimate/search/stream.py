@@ -1,6 +1,6 @@
-"""Judges the columns of a sweep by `rig.estimate.search.rows` while its frames come in. The result is the same, bit for
-bit, as from the counts of the whole sweep.
+"""Judges columns while their frames come in: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
+`rig.estimate.search.rows` judges, and the result is the same, bit for bit, as from the counts of the whole sweep.
 `ColumnJudge` is the counter of `likelihood`: it judges each column as soon as it is complete and keeps its counts only
 on the rows that are needed to learn and to check the map. Rows are processed in chunks, so that counts never leave the
 cache. A chunk's counters, uint64 bit planes (`rig.count.kernels`), take the frames of a column as they come. At the

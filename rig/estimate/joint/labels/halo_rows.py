@@ -4,7 +4,11 @@ The halo (light of the stripe that fog scatters to both sides, `rig.estimate.row
 The tables of `rig.estimate.joint.labels.tables` take it to be as bright everywhere as at the stripe, which is right for
 the pixels around the stripe. The difference elsewhere varies slowly with the stripe's position and from pixel to pixel.
 So it is tabled for stripes BLOCK_PX apart, with linear interpolation, and for the mean counts of blocks of BLOCK_PX
-pixels (`HaloTables`: int16 weights, float32 constants in nats per exposure).
+pixels. To the score of a stripe at place x it adds, in K exposures,
+
+    K constant(x) + sum over blocks of (mean count of the block) weight(block, x)
+
+with weights int16 and constants float32 in nats per exposure (`HaloTables`).
 """
 
 from typing import Final, NamedTuple

@@ -10,7 +10,8 @@ is as accurate as the maximum of their common likelihood, and 1 / sqrt(sum h_n) 
 the stripes' brightness is pooled; otherwise a dark stripe would be taken for a brighter one that stands on haze.
 
 Counts are stored column by column, but answers are processed row by row, LANES columns to a vector. So the counts
-around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`).
+around all stripes are brought into the order of the answers once, in tiles of rows and columns (`fetch_counts`). All
+results are float32 (rows, columns).
 """
 
 from typing import Final, NamedTuple

@@ -1,9 +1,8 @@
-"""Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, LANES stripes to a
-vector.
+"""Sums over neighbours on one surface, and places combined with pairs of opposite neighbours, compiled.
 
 Pooling: sums over those neighbours whose distance from the far end of the depth range differs by at most SAME_PX. Each
-stripe has its own set of them, so running sums cannot be used. Rows are processed in copies with a margin of NaN
-(`with_margin`), so that no bounds need checking. All arrays are float32 (rows, columns).
+stripe has its own set of them, so running sums cannot be used. Rows are processed LANES stripes to a vector, in copies
+with a margin of NaN (`with_margin`), so that no bounds need checking. All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
 joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
