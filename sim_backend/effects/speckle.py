@@ -7,9 +7,9 @@ The light of M independent grains is gamma distributed with mean 1. Behind an f-
 with the factor 2 since a diffuse surface depolarises (Goodman, "Speckle phenomena in optics", 2007, sections 4.2 and
 4.6). With the default sensor at f/2 the contrast is 0.15.
 
-Multiplies the stripe, the light that earlier effects added to `rate` (rows, width). The grains depend on the pixel and
-the position of the sheet in steps of the line's width, so they stay for all exposures of a column and return in every
-sweep. Cost: about 0.4 ms per mirror position for 512 rows.
+Multiplies the stripe, the light that earlier effects added to `rate`, float64 or float32 (rows, width). The grains
+depend on the pixel and the position of the sheet in steps of the line's width, so they stay for all exposures of a
+column and return in every sweep. Cost: about 0.4 ms per mirror position for 512 rows.
 """
 
 import math
