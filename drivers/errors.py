@@ -34,6 +34,10 @@ class DeviceDisconnected(DeviceError):
     """Raised when a device that was open is gone: unplugged, powered down or its connection closed."""
 
 
+GONE = (DeviceDisconnected, DeviceTimeout)
+"""For an `except`: a device that was open is gone or does not answer, so that nothing can be done to it from here."""
+
+
 class DeviceFault(DeviceError):
     """Raised when a device reports a fault of its own, or does something else than it was told."""
 

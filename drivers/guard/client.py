@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceTimeout, GuardLost
+from drivers.errors import DeviceError, DeviceTimeout, GuardLost
 from drivers.guard.channel import Channel, Heartbeat, Message, error_from, plain_ports
 from drivers.guard.process import Rescue
 from drivers.guard.watch import GuardLimits, WatchedProcess
@@ -44,7 +44,7 @@ class _Guarded(Device):
     def _ask(self, verb: str, *arguments: Any) -> Any:
         return self._guard.ask(self._slot, verb, *arguments)
 
-    def _lost_at_close(self, error: DeviceDisconnected) -> None:
+    def _lost_at_close(self, error: DeviceError) -> None:
         raise error  # a scan whose light could not be ended has not ended well
 
     def _do_close(self) -> None:
@@ -74,7 +74,7 @@ class GuardedLaser(_Guarded, LineLaser):
         """Do nothing: `arm` in the guard checks already, and a slow laser need not be asked twice."""
 
     def _do_arm(self, power_w: float) -> None:
-        self._ask("arm", power_w)
+        self._guard.changed = self._ask("arm", power_w)
 
     def _do_pause(self) -> None:
         self._ask("pause")
@@ -170,6 +170,8 @@ class Guard:
         self._opening = {slot: threading.Event() for slot in configs}
         self._proxies: dict[str, Any] = {}
         self._armed = False
+        self.changed: list[str] = []
+        """The laser's settings that the guard has changed (`LineLaser.changed`), as far as it has told."""
         self._answer_s = ANSWER_S | {"arm": ANSWER_S["arm"] + getattr(laser, "warm_up", 0.0)}
         self.failure: DeviceError | None = None
         """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
@@ -349,6 +351,7 @@ class Guard:
     def _take(self, message: Message) -> None:
         if "opened" in message:
             self._opened[message["opened"]] = message
+            self.changed = message.get("about", {}).get("changed", self.changed)
             self._opening[message["opened"]].set()
         elif "tripped" in message:
             self.failure = error_from(message["tripped"])
@@ -370,7 +373,7 @@ class Guard:
             self._release()
             sys.setswitchinterval(_RESCUE_SWITCH_S)
             slots = {slot for slot, answer in self._opened.items() if "about" in answer}
-            self._outcome = self._rescue.run(slots, self._armed)
+            self._outcome = self._rescue.run(slots, self._armed, self.changed)
             _log.error("the laser guard is gone; %s", self._outcome)
         self._process.wait()
         self._rescued.set()

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from enum import Enum
 from typing import Self
 
-from drivers.errors import DeviceDisconnected, WrongState
+from drivers.errors import GONE, DeviceError, WrongState
 
 _log = logging.getLogger(__name__)
 
@@ -68,15 +68,16 @@ class Device(ABC):
     def close(self) -> None:
         """Leave the device safe (laser paused, gate low, mirror parked if it has moved) and release it.
 
-        A second call does nothing. If the device was unplugged, nothing can be done about it from here, so nothing is
-        raised, except for a device that the guard owns (`drivers.guard`). Any other failure to leave it safe is raised.
+        A second call does nothing. If the device was unplugged or does not answer, nothing can be done about it from
+        here: that is logged, not raised, except for a device that the guard owns (`drivers.guard`). Any other failure
+        to leave it safe is raised.
         """
         if self._state is DeviceState.CLOSED:
             return
         _log.info("%s: close", self._name)
         try:
             self._make_safe()
-        except DeviceDisconnected as error:
+        except GONE as error:
             self._lost_at_close(error)
         finally:
             self._state = DeviceState.CLOSED
@@ -104,8 +105,8 @@ class Device(ABC):
     def _make_safe(self) -> None:
         """End what still runs; called once by `close`, in any open state. Each interface implements it."""
 
-    def _lost_at_close(self, error: DeviceDisconnected) -> None:
-        """Log that the device was unplugged, so that `close` could not leave it safe. The guard's devices raise it."""
+    def _lost_at_close(self, error: DeviceError) -> None:
+        """Log that the device is gone, so that `close` could not leave it safe. The guard's devices raise the error."""
         _log.error("%s: closed, but it could not be left safe: %s", self._name, error)
 
     @abstractmethod

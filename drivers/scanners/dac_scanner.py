@@ -20,7 +20,7 @@ from typing import Any, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault
+from drivers.errors import GONE, DeviceDisconnected, DeviceError, DeviceFault
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
 from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import Endpoint
@@ -280,7 +280,7 @@ class DacScanner(BeamScanner):
 
     def _make_safe(self) -> None:
         # A lost laser DAC has no power or no points. A lost NI card keeps its levels, which nothing here can change.
-        with suppress(DeviceDisconnected):
+        with suppress(*GONE):
             super()._make_safe()
 
     def _do_close(self) -> None:
@@ -292,8 +292,8 @@ class DacScanner(BeamScanner):
                     self._go(0.0)
             finally:
                 self._dac.close()
-        except DeviceDisconnected as error:
-            _log.warning("%s", error)
+        except GONE as error:
+            self._lost_at_close(error)
 
     def _go(self, command: float) -> None:
         """Bring the mirror to rest at `command` by a ramp at the highest point rate, unless it rests there already."""

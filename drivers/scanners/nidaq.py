@@ -500,7 +500,7 @@ class Nidaq(DacScanner):
     def __init__(self, dac: NidaqDac, config: NidaqConfig) -> None:
         """Take over `dac`, which is closed with the scanner. Takes the markers low and the mirror to the centre."""
         super().__init__(dac, config)
-        self._counters = config.counters
+        self._card, self._counters = dac.card, config.counters
         try:
             self._position = dac.halt()
             if self._position:
@@ -508,6 +508,10 @@ class Nidaq(DacScanner):
         except BaseException:
             dac.card.disconnect()
             raise
+
+    def _make_safe(self) -> None:
+        self._card.hurry()
+        super()._make_safe()
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
         for bit, name in self._counters.items():

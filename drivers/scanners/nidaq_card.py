@@ -32,6 +32,8 @@ GRPC_PREFIX = "grpc="
 CALL_S = 2.0
 _LATE_S = 0.5
 """Deadlines for a call to a gRPC server, and for one after a call that was late, as closing takes some 15 calls."""
+_CLOSE_S, _CLOSE_LATE_S = 0.5, 0.05
+"""The same once the card is being closed."""
 _CONNECT_S = 5.0
 """Deadline for reaching a gRPC server."""
 
@@ -77,8 +79,9 @@ class NiCard:
         self._ni, self.const, self.writers, system, errors = map(_import, modules)
         self._error: type[Exception] = errors.Error
         self._tasks: list[Any] = []
+        self._call_s, self._late_s = CALL_S, _LATE_S
         self._limit_s = CALL_S
-        self._channel = _connect(server, lambda: self._limit_s) if server else None
+        self._channel = _connect(server, self._deadline_s) if server else None
         self._options = self._ni.GrpcSessionOptions(self._channel, "") if self._channel else None
         try:
             with self.errors():
@@ -90,12 +93,21 @@ class NiCard:
 
     @contextmanager
     def patient(self, limit_s: float) -> Iterator[None]:
-        """Within this context a call to a server may take at most `limit_s`, or `CALL_S` if that is shorter."""
-        self._limit_s = min(limit_s, CALL_S)
+        """Within this context a call to a server may take at most `limit_s`, or the usual time if that is shorter."""
+        self._limit_s = min(limit_s, self._call_s)
         try:
             yield
         finally:
-            self._limit_s = CALL_S
+            self._limit_s = self._call_s
+
+    def hurry(self) -> None:
+        """Wait no longer for the server, from now on, than a close may take."""
+        self._call_s, self._late_s = _CLOSE_S, _CLOSE_LATE_S
+        self._limit_s = min(self._limit_s, _CLOSE_S)
+
+    def _deadline_s(self, late: bool) -> float:
+        """Deadline for a call; late: whether the one before was not answered in time."""
+        return min(self._limit_s, self._late_s) if late else self._limit_s
 
     def disconnect(self) -> None:
         """Close the channel to the server, if there is one. Leaves the card as it is. May raise `DeviceTimeout`."""
@@ -211,14 +223,14 @@ def _import(module: str) -> Any:
         raise ProtocolError(f"nidaq: no package {error.name}; install the extra spadrig[nidaq]: {command}") from error
 
 
-def _connect(server: str, limit_s: Callable[[], float]) -> Any:
+def _connect(server: str, deadline_s: Callable[[bool], float]) -> Any:
     grpc = _import("grpc")
 
     class Deadline(grpc.UnaryUnaryClientInterceptor):  # type: ignore[misc, name-defined]
         late = False
 
         def intercept_unary_unary(self, go_on: Any, details: Any, request: Any) -> Any:
-            limited = details._replace(timeout=min(limit_s(), _LATE_S if self.late else CALL_S))
+            limited = details._replace(timeout=deadline_s(self.late))
             call = _aside(lambda: go_on(limited, request), CALL_S + 1)
             self.late = call.code() is grpc.StatusCode.DEADLINE_EXCEEDED
             return call

@@ -14,13 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.errors import (
-    DeviceBusy,
-    DeviceDisconnected,
-    DeviceFault,
-    DeviceTimeout,
-    ProtocolError,
-)
+from drivers.errors import GONE, DeviceBusy, DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.tap import IN, OUT, Tap
 from drivers.transports.tcp_line import TcpStream
 
@@ -130,7 +124,7 @@ class Spad512sLine:
         """Close a connection found gone or silent within this context: a late answer would pass for the next one."""
         try:
             yield
-        except (DeviceTimeout, DeviceDisconnected):
+        except GONE:
             self.hang_up()
             raise
 
@@ -160,7 +154,7 @@ class Spad512sLine:
             if not _ended(came):
                 self.tell("STOP")
                 came += self.rest()
-        except (DeviceDisconnected, DeviceTimeout):  # the program is gone, or takes nothing any more
+        except GONE:  # the program is gone, or takes nothing any more
             came = b""
         if not _ended(came):
             limit_s = self._deadlines.stop_s

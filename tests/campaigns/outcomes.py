@@ -8,7 +8,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from drivers.errors import DeviceDisconnected, DeviceError
+from drivers.errors import DeviceError
 from drivers.interfaces.device import Device
 
 SEEDS_APART = 1_000_000
@@ -59,7 +59,7 @@ def ending(act: Callable[[], str], now_s: Callable[[], float], deadline_s: float
 def close_or_raise(device: Device) -> None:
     """Close a device; unlike `close` alone, raise the error if it was lost before it was safe."""
 
-    def raise_it(error: DeviceDisconnected) -> None:
+    def raise_it(error: DeviceError) -> None:
         raise error
 
     device._lost_at_close = raise_it  # type: ignore[method-assign]

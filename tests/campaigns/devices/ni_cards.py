@@ -25,7 +25,7 @@ from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from sim_backend.wire.firmware.nidaq import NidaqModel
 from sim_backend.wire.serve.grpc import GrpcServer
 from tests.campaigns.devices import scanners
-from tests.campaigns.outcomes import Ending
+from tests.campaigns.outcomes import Ending, close_or_raise
 from tests.wire.faults import Fault, FaultSchedule
 from tests.wire.scanners import GALVO
 
@@ -177,8 +177,11 @@ def sequence(seed: int) -> Ending:
     surroundings = Surroundings(clock, None, 1, {"dac": Endpoint("127.0.0.1:1/Dev1")})
 
     def act() -> str:
-        with entry.create(config, surroundings) as device:
+        device = entry.create(config, surroundings)
+        try:
             end = scanners.judged(NIDAQ, rng, device, lit_wave(device), lambda: now_s(clock), model.history)
+        finally:
+            close_or_raise(device)
         if not (channel.gone or channel.gone_told):
             require_rest(model, now_s(clock), {Fault.LOST, Fault.STALL}.isdisjoint(schedule.struck))
         return end

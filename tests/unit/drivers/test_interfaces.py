@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceDisconnected, DeviceError, DeviceFault, LimitExceeded, WrongState
+from drivers.errors import GONE, DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, LimitExceeded, WrongState
 from drivers.interfaces import (
     OUT_GATE,
     BurstMode,
@@ -63,7 +63,9 @@ class TroubledLaser(LineLaser):
         self.calls.append("close")
 
 
-@pytest.mark.parametrize("error", [None, DeviceFault("lamp: stuck"), DeviceDisconnected("lamp: unplugged")])
+@pytest.mark.parametrize(
+    "error", [None, DeviceFault("lamp: stuck"), DeviceDisconnected("lamp: unplugged"), DeviceTimeout("lamp: silent")]
+)
 def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off(
     error: DeviceError | None, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -74,7 +76,7 @@ def test_a_laser_is_paused_before_its_port_is_given_back_and_never_switched_off(
     assert laser.state is (DeviceState.RUNNING if error else DeviceState.CONFIGURED)
     with pytest.raises(DeviceFault, match="stuck") if isinstance(error, DeviceFault) else nullcontext():
         laser.close()
-    assert ("could not be left safe" in caplog.text) is isinstance(error, DeviceDisconnected)
+    assert ("could not be left safe" in caplog.text) is isinstance(error, GONE)
     laser.close()
     assert laser.calls == ["arm 0.01", "pause", "pause", "close"]
     assert laser.state is DeviceState.CLOSED
