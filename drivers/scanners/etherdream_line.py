@@ -38,8 +38,8 @@ _REPLY = struct.Struct("<cxx3B2xH2xH2I")
 _BROADCAST = struct.Struct("<6s3HI20x")
 _VERSION_BYTES = 32
 _CONNECT_S = 2.0
-_REPLY_S = 1.0
-"""Deadline for a reply. An Ether Dream 2 usually takes 0.5 ms and sometimes 35 ms."""
+REPLY_S = 1.0
+"""Deadline for a reply while nothing plays. An Ether Dream 2 usually takes 0.5 ms and sometimes 35 ms."""
 BROADCAST_S = 1.5
 """Time within which a board broadcasts at least once."""
 
@@ -154,11 +154,11 @@ class EtherDreamLine:
         """The board's numeric address."""
         return self._stream.peer
 
-    def ask(self, command: bytes) -> Reply:
+    def ask(self, command: bytes, within_s: float = REPLY_S) -> Reply:
         """Send one command, not `VERSION`, and return its reply. Raises `DeviceTimeout`, `DeviceDisconnected` or
         `ProtocolError`; each of them closes the connection, and every later command raises the same error.
         """
-        return Reply.read(self._exchange(command, _REPLY.size))
+        return Reply.read(self._exchange(command, _REPLY.size, within_s))
 
     def tell(self, command: bytes) -> Reply:
         """Send one command and return its reply. Raises `CommandRefused` if it is not accepted, and as `ask`."""
@@ -178,29 +178,29 @@ class EtherDreamLine:
         """Close the connection; a second call does nothing."""
         self._stream.close()
 
-    def _exchange(self, command: bytes, n: int) -> bytes:
+    def _exchange(self, command: bytes, n: int, within_s: float = REPLY_S) -> bytes:
         with self.lock:
             if self._lost is not None:
                 raise self._lost
             try:
                 if self._tap is not None:
                     self._tap.note("tcp", OUT, command)
-                self._stream.send(command, _REPLY_S)
-                return self._read(command[:1], n)
+                self._stream.send(command, within_s)
+                return self._read(command[:1], n, within_s)
             except BaseException as error:
                 interrupted = DeviceDisconnected(f"{self._name}: a command was interrupted; open it again")
                 self._lost = error if isinstance(error, DeviceError) else interrupted
                 self._stream.close()
                 raise
 
-    def _read(self, command: bytes, n: int) -> bytes:
-        reply = self._stream.receive_exactly(n, _REPLY_S)
+    def _read(self, command: bytes, n: int, within_s: float = REPLY_S) -> bytes:
+        reply = self._stream.receive_exactly(n, within_s)
         if self._tap is not None:
             self._tap.note("tcp", IN, reply)
         if len(reply) < n:
             raise DeviceTimeout(
-                f"{self._name}: {len(reply)} of {n} B in reply to command {_shown(command)} within {_REPLY_S:g} s; "
-                "power-cycle it"
+                f"{self._name}: {len(reply)} of {n} B in reply to command {_shown(command)} within {within_s:.2g} s; "
+                "check its cable and power-cycle it"
             )
         if command != VERSION and reply[1:2] != command:
             raise ProtocolError(

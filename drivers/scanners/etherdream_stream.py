@@ -27,6 +27,7 @@ from drivers.scanners.etherdream_line import (
     PLAYING,
     PREPARE,
     PREPARED,
+    REPLY_S,
     STOPPED,
     UNDERFLOW,
     EtherDreamLine,
@@ -49,6 +50,8 @@ _RATE_CHANGE, _FULL = 0x8000, 0xFFFF
 _POINT = np.dtype([(name, "<i2" if name in "xy" else "<u2") for name in ("control", *"xyrgbi", "u1", "u2")])
 _TOLERANCE_S = 0.002
 """Time by which two replies may contradict each other about when the first point was played."""
+_LATE_S = 0.05
+"""Time after the end of the queued points for which a reply is still waited for. Then the points have run dry."""
 _MOST_AHEAD = 50
 """Most replies in a row whose count of played points is one ahead. In a sound board even one such reply is rare."""
 
@@ -96,6 +99,8 @@ class PointStream:
         self._start = StartTime()
         """Bounds of the time of the first point at the present rate."""
         self._moved_s = 0.0
+        self._dry_s = math.inf
+        """Time by which all points sent will have been played; inf: none was played yet."""
         line.tell(PREPARE)
 
     def change_rate(self, clock_hz: Fraction, most: int) -> None:
@@ -147,8 +152,9 @@ class PointStream:
     def _exchange(self, command: bytes, n: int = 0) -> None:
         with self._line.lock:
             asked_s = now_s(self._clock)
-            reply = self._line.ask(command)
+            reply = self._line.ask(command, min(REPLY_S, max(self._dry_s - asked_s, 0.0) + _LATE_S))
             self.sent += n
+            self._dry_s += n / self._rate_hz
             self._check(reply, asked_s, now_s(self._clock))
 
     def _check(self, reply: Reply, asked_s: float, answered_s: float) -> None:
@@ -169,6 +175,8 @@ class PointStream:
         elif self._began and answered_s - self._moved_s > PATIENCE_S:
             raise DeviceFault(f"{self._name}: plays no points for {PATIENCE_S:g} s; power-cycle it")
         self.played = played
+        if played > self._from:  # all that is queued plays at the present rate
+            self._dry_s = answered_s + (self.sent - played) / self._rate_hz
         if played > self._from + 1:  # the timer takes a new rate over one point after the one that asks for it
             self._check_rate(reply.rate_hz, asked_s, answered_s)
 

@@ -212,14 +212,11 @@ class Acquisition:
             self._end_start(pipeline, assembler)
 
     def _darken(self) -> None:
-        """Take the gate low on the thread of a scanner that has failed: the caller's may be at work on a map when its
-        turn comes to end the run. If that fails, the laser is paused; the caller's thread then tries again, and reports
-        it."""
-        try:
-            self._rig.sync.gate_low()
-        except DeviceError:
+        """Take the gate low and pause the laser on the thread of a scanner that has failed: the caller's may be at work
+        on a map when its turn comes to end the run. The caller's thread does both again, and reports what fails."""
+        for darken in (self._rig.sync.gate_low, self._rig.laser.pause):
             with suppress(DeviceError):
-                self._rig.laser.pause()
+                darken()
 
     def _guard_limits(self, sweeps: int) -> GuardLimits:
         """The laser guard's time limits for this start. In a burst they allow for silence until it is read out."""

@@ -24,6 +24,7 @@ from drivers.scanners.etherdream import EtherDream, EtherDreamConfig
 from drivers.scanners.etherdream_line import (
     ACCEPTED,
     PREPARED,
+    REPLY_S,
     Broadcast,
     EtherDreamLine,
     Reply,
@@ -150,8 +151,9 @@ class Board(EtherDreamLine):
             code, engine, playback, 0, flags, **{"fullness": 0, "rate_hz": 10_000, "count": 0, **numbers}
         )
 
-    def ask(self, command: bytes) -> Reply:
+    def ask(self, command: bytes, within_s: float = REPLY_S) -> Reply:
         self.commands.append(command)
+        self.within_s = within_s
         return self.reply
 
 
@@ -226,6 +228,24 @@ def test_a_count_that_is_read_one_point_later_is_no_fault_unless_it_always_is(pl
     assert stream.played == 50
     with pytest.raises(DeviceFault, match="lost or repeated"):
         stream.ping()
+
+
+def test_a_reply_is_waited_for_no_longer_than_queued_points_play(playing: Playing) -> None:
+    board, stream, clock = playing
+    assert board.within_s == REPLY_S, "nothing played before"
+    for fullness in (80, 60):
+        clock.sleep(2e-3)
+        board.says(fullness=fullness, count=100 - fullness)
+        stream.ping()
+    assert board.within_s == pytest.approx(80 / 10_000 - 2e-3 + 0.05)
+    stream.change_rate(Fraction(1000), 250)
+    board.says(fullness=60 + 50, count=40)
+    stream.send(points(*[0.0] * 50))
+    stream.ping()
+    assert board.within_s == pytest.approx(60 / 10_000 + 50 / 1000 + 0.05), "slower ones behind them"
+    clock.sleep(0.5)
+    stream.ping()
+    assert board.within_s == pytest.approx(0.05), "the host was late"
 
 
 # Whole runs.
@@ -361,15 +381,20 @@ def test_a_single_point_too_many_shortly_before_the_end_is_a_fault() -> None:
         assert "lost or repeated" in str(device.status.fault)
 
 
-def test_a_lost_connection_is_told_and_a_board_that_hangs_ends_the_run_in_time() -> None:
+def test_a_lost_connection_is_told_and_a_board_that_hangs_ends_the_run_in_time(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     for strike, error in ((TcpWire.unplug, DeviceDisconnected), (TcpWire.hang, DeviceTimeout)):
         with wired() as wire:
             device = open_etherdream(wire)
             device.load(cosine(device), 1000)
             device.start()
             let_pass(wire, 0.1)
-            began_s = wire.now_s
-            strike(wire)
+            faults: list[float] = []
+            device.on_fault = lambda wire=wire, faults=faults: faults.append(wire.now_s)  # type: ignore[misc]
+            with wire.lock:
+                began_s = wire.now_s
+                strike(wire)
             if error is DeviceDisconnected:
                 with pytest.raises(error, match="cable"):
                     finish(device)
@@ -377,13 +402,30 @@ def test_a_lost_connection_is_told_and_a_board_that_hangs_ends_the_run_in_time()
             else:
                 finish(device)
                 assert "in reply to command" in str(device.status.fault)
-                with pytest.raises(error):
-                    device.close()
+                assert faults[0] - began_s < 0.06 + 0.05 + 0.01, "as long as points were queued, and 50 ms"
+                device.close()
+                assert "could not be left safe: Ether Dream: 0 of 22 B" in caplog.text
             assert wire.now_s - began_s < 2
             assert device.state is DeviceState.CLOSED
             wire._clock.sleep(0.5)
             assert not wire.model.moving(wire.now_s)
             assert wire.model.history.command(np.array([wire.now_s]))[0] == CENTRE
+
+
+@pytest.mark.parametrize("parked", [False, True])
+def test_a_board_that_hangs_is_closed_within_a_second_without_an_error(
+    parked: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    with wired() as wire:
+        device = open_etherdream(wire)
+        if parked:
+            device.park()
+        with wire.lock:
+            began_s = wire.now_s
+            wire.hang()
+        device.close()
+        assert wire.now_s - began_s < 1.1
+        assert "could not be left safe" in caplog.text
 
 
 def test_a_board_in_use_or_stopped_is_refused_or_cleared() -> None:

@@ -151,7 +151,7 @@ def test_a_scanner_that_stops_early_ends_the_scan():
     assert log == START + STOP
 
 
-def test_the_gate_goes_low_on_the_thread_of_a_scanner_that_fails():
+def test_gate_and_laser_are_dark_on_the_thread_of_a_scanner_that_fails():
     def fails(seq):
         if seq == 2:
             rig.scanner.on_fault()
@@ -161,7 +161,7 @@ def test_the_gate_goes_low_on_the_thread_of_a_scanner_that_fails():
     rig, log = rig_of(5, behaviour=fails)
     with pytest.raises(DeviceFault, match="ran dry"):
         list(acquisition(rig, PLAN, 5).run())
-    assert log == [*START, "sync.gate_low", "noticed", *STOP]
+    assert log == [*START, "sync.gate_low", "laser.pause", "noticed", *STOP]
 
 
 def test_a_gate_that_does_not_go_low_has_the_laser_paused_on_that_thread():
