@@ -12,7 +12,7 @@ what follows each wait must be the same. Other programs, such as blanking patter
 without that, so the box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes
 the outputs low after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or
 network are late; then the gate goes on opening at each scan marker until the count is full, the markers cease or
-`abort` is called. If the box does not answer, `port_lost` tells the guard, which ends the laser's light.
+`abort` is called. If the box does not answer for `silence`, `port_lost` tells the guard, which ends the laser's light.
 
 **Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so a mirror that stops
 would be lit until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless the
@@ -28,15 +28,16 @@ import os
 import re
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
 from drivers.clock import now_s
 from drivers.errors import (
-    DeviceDisconnected,
+    GONE,
     DeviceError,
     DeviceFault,
     DeviceNotFound,
@@ -46,7 +47,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, Surroundings, alone, config_of
+from drivers.registry import Kind, Surroundings, alone, config_of, quantity
 from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
 from drivers.sync.pulsestreamer_rpc import CALL_S, JsonRpc
 from drivers.sync.pulsestreamer_sequence import (
@@ -57,6 +58,7 @@ from drivers.sync.pulsestreamer_sequence import (
     compile_sequence,
 )
 from drivers.transports.endpoints import resolve
+from drivers.units import Seconds
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +72,8 @@ AUTO, MANUAL = 0, 1
 """Rearming (`setTrigger`): AUTO arms the trigger again after each sequence, MANUAL does not."""
 CHECK_S = 0.2
 """Time after which a box that waits for the scan marker is asked whether it still does: a restart loses its program."""
+CLOSE_S = 0.3
+"""Deadline for each of the at most three calls to a box that does not answer when it is closed."""
 CLOCKS = {"internal": 0, "external-125MHz": 1, "external-10MHz": 2}
 
 _DARK = compile_sequence("dark", [Pulse(0, 248e-9)], 1, OutputPins(), external_hold=False).encoded
@@ -103,6 +107,10 @@ class PulseStreamerConfig(BoardConfig):
         Literal["none", "external"],
         Field(description="external: a logic chip lets the gate through only while the scan marker is high"),
     ] = "none"
+    silence: Annotated[
+        Seconds,
+        Field(ge=0.1, le=4, description="longest silence of the box while a program runs", examples=["300 ms"]),
+    ] = 0.3
     frame_output: Annotated[int, Field(ge=0, le=7, description="output that triggers the SPAD: 0 to 7")] = 0
     gate_output: Annotated[int, Field(ge=0, le=7, description="output that is the laser's gate")] = 1
     marker_output: Annotated[int, Field(ge=0, le=7, description="output that marks the SPAD's records")] = 2
@@ -133,7 +141,7 @@ class PulseStreamer(SyncBoard):
         self._lost = False
         try:
             self._rpc.call("constant", LOW)
-        except (DeviceDisconnected, DeviceTimeout) as error:
+        except GONE as error:
             raise DeviceNotFound(str(error)) from None
         self._rpc.call("reset")  # ends what else a program may have left: a square wave, a trigger
         self._lower()
@@ -145,14 +153,18 @@ class PulseStreamer(SyncBoard):
         self._check_timing()
 
     @classmethod
-    def open(cls, port: str, *, surroundings: Surroundings | None = None, **settings: Any) -> "PulseStreamer":
+    def open(
+        cls, port: str, *, silence_s: float = 0.3, surroundings: Surroundings | None = None, **settings: Any
+    ) -> "PulseStreamer":
         """Open a box by itself, without a config file.
 
-        port, settings (clock, hold, frame_output, gate_output, marker_output): as in `PulseStreamerConfig`.
-        surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if
-        the box cannot be opened.
+        port, settings (clock, hold, frame_output, gate_output, marker_output): as in `PulseStreamerConfig`. silence_s:
+        the longest silence of the box while a program runs. surroundings: of an emulator. Raises `LimitExceeded` for a
+        setting that is not possible, other `DeviceError` if the box cannot be opened.
         """
-        return cls(config_of(PulseStreamerConfig, port=port, **settings), surroundings or alone())
+        silence = quantity("silence_s", silence_s, "time")
+        config = config_of(PulseStreamerConfig, port=port, silence=silence, **settings)
+        return cls(config, surroundings or alone())
 
     def ask(self, method: str, *params: Any) -> Any:
         """Call a method of the box, such as `ask("getTemperature")`, and return its result. Nothing is checked: a
@@ -178,7 +190,8 @@ class PulseStreamer(SyncBoard):
 
     @property
     def port_lost(self) -> bool:
-        """Whether the box gave no answer, or a wrong one, while a program ran. May be called from any thread."""
+        """Whether the box gave no answer for `silence`, or a wrong one, while a program ran. May be called from any
+        thread."""
         return self._lost
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -243,6 +256,10 @@ class PulseStreamer(SyncBoard):
                 return SyncStatus("running", None)
             return SyncStatus(self._ended, 0 if self._safe else None)
 
+    def _make_safe(self) -> None:
+        self._rpc.call_s = min(self._rpc.call_s, CLOSE_S)
+        super()._make_safe()
+
     def _do_close(self) -> None:
         if self._run is not None:
             self._run.over.set()
@@ -265,12 +282,13 @@ class PulseStreamer(SyncBoard):
             self._armed.clear()
             self._safe = True
 
-    def _has_ended(self, run: _Run, asked_s: float, plays: bool) -> bool:
-        """Whether a program has ended, by the box's answer; if so, take the outputs low. May raise `DeviceError`."""
+    def _has_ended(self, run: _Run, asked_s: float, plays: bool, ask: Callable[[str], Any] | None = None) -> bool:
+        """Whether a program has ended, by the box's answer; if so, take the outputs low. May raise `DeviceError`. ask:
+        as in `_flag`."""
         if run.count is not None:
             ended = run.count.take(asked_s, now_s(self._clock), plays)
         else:
-            ended = not plays and self._flag("hasFinished")
+            ended = not plays and self._flag("hasFinished", ask)
             if not (plays or ended or run.waits) and self._aborts == run.aborts:
                 raise DeviceFault(f"{self.name}: its program is gone: it has restarted, or another program uses it")
         if ended:
@@ -281,14 +299,15 @@ class PulseStreamer(SyncBoard):
 
     def _watch(self, run: _Run) -> None:
         """Count the sweeps of a program until it is over. On an error set `port_lost` and try to take outputs low."""
+        ask = partial(self._rpc.ask, silence_s=self._config.silence)
         checked_s = now_s(self._clock)
         while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(now_s(self._clock))):
             try:
                 asked_s = now_s(self._clock)
-                plays = self._flag("isStreaming")
-                ended = self._has_ended(run, asked_s, plays)
+                plays = self._flag("isStreaming", ask)
+                ended = self._has_ended(run, asked_s, plays, ask)
                 if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
-                    self._check_trigger(RISING)
+                    self._check_trigger(RISING, ask)
                     checked_s = asked_s
             except Exception as error:
                 if not run.over.is_set():
@@ -301,17 +320,18 @@ class PulseStreamer(SyncBoard):
                     except DeviceError:
                         run.over.wait(CHECK_S)
 
-    def _check_trigger(self, wanted: int) -> None:
-        found = self._rpc.call("getTriggerStart")
+    def _check_trigger(self, wanted: int, ask: Callable[[str], Any] | None = None) -> None:
+        found = (ask or self._rpc.call)("getTriggerStart")
         if found != wanted:
             raise DeviceFault(
                 f"{self.name}: its trigger is {found!r}, not {wanted}: it has restarted, or another program uses it; "
                 "end that program and open it again"
             )
 
-    def _flag(self, method: str) -> bool:
-        """A yes or no of the box, which says true, false, 1 or 0."""
-        value = self._rpc.call(method)
+    def _flag(self, method: str, ask: Callable[[str], Any] | None = None) -> bool:
+        """A yes or no of the box, which says true, false, 1 or 0. ask: calls the method; None: with the usual
+        deadline."""
+        value = (ask or self._rpc.call)(method)
         if value not in (0, 1):
             raise ProtocolError(f"{self.name} answers {method} with {value!r}, neither yes nor no; report it")
         return bool(value)

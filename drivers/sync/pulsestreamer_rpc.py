@@ -5,15 +5,19 @@ call has a connection of its own, so that one that hangs holds up no other, leas
 The number in an answer is not compared with that of the question: newer clients that do so refuse the box's answers.
 """
 
+import errno
 import http.client
 import itertools
 import json
 import math
+import os
+import selectors
 import socket
 import time
+from dataclasses import dataclass
 from typing import Any
 
-from drivers.errors import CommandRefused, DeviceDisconnected, DeviceNotFound, DeviceTimeout, ProtocolError
+from drivers.errors import GONE, CommandRefused, DeviceDisconnected, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.json_text import parse_json
 from drivers.transports.endpoints import one_line
 from drivers.transports.tap import IN, OUT, Tap
@@ -26,10 +30,13 @@ LATE_CALLS = 5
 stop the program in its midst, with the gate high."""
 RETRY_S = 0.3
 """Time for which a refused connection, or one closed without a word, is tried again: the box may serve others."""
-_REPEATABLE = ("constant", "get", "has", "is")
+_QUESTIONS = ("get", "has", "is")
+_REPEATABLE = ("constant", *_QUESTIONS)
 """Beginnings of methods that may be called again if the box may have heard them already. A second `stream` could stop a
 sequence in its midst, with the gate high."""
 _RETRY_PAUSE_S = 0.005
+_STEP_S = 0.01
+"""Time from one look at what has arrived to the next."""
 _MOST_BYTES = 65_536
 """Longer than any answer."""
 
@@ -42,7 +49,9 @@ class JsonRpc:
 
         Raises `DeviceNotFound` for a malformed address or an unknown host.
         """
-        self._name, self._address, self._tap, self._call_s = name, address, tap, call_s
+        self._name, self._address, self._tap = name, address, tap
+        self.call_s = call_s
+        """Deadline for a call."""
         self._numbers, self._unanswered_s = itertools.count(1), -math.inf
         host, colon, port = address.partition(":")
         if not host or (colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65_536)):
@@ -55,18 +64,27 @@ class JsonRpc:
 
     @property
     def settles_in_s(self) -> float:
-        """Time in which the box may still hear a call that it has not answered; 0 or less if there is none."""
-        return self._unanswered_s + LATE_CALLS * self._call_s - time.monotonic()
+        """Time in which the box may still hear a call, other than a question, that it has not answered; 0 or less if
+        there is none."""
+        return self._unanswered_s + LATE_CALLS * self.call_s - time.monotonic()
 
-    def call(self, method: str, *params: Any) -> Any:
-        """Call a method of the box and return its result.
+    def ask(self, method: str, silence_s: float) -> Any:
+        """Ask the box a question; after half of `silence_s` ask once more, by another connection: if the first packet
+        of a connection is lost, the computer sends it again only after 1 s. Raises as `call`."""
+        try:
+            return self.call(method, within_s=silence_s / 2)
+        except GONE:
+            return self.call(method, within_s=silence_s / 2)
+
+    def call(self, method: str, *params: Any, within_s: float | None = None) -> Any:
+        """Call a method of the box and return its result. within_s: deadline in place of `call_s`.
 
         Raises `DeviceDisconnected` if the box cannot be reached, `DeviceTimeout` if it does not answer in time,
         `CommandRefused` with the box's own words, or `ProtocolError` for an answer that is no JSON-RPC.
         """
         body = json.dumps({"jsonrpc": "2.0", "id": next(self._numbers), "method": method, "params": params}).encode()
         self._note(OUT, body)
-        text = self._exchange(method, body)
+        text = self._exchange(method, body, within_s or self.call_s)
         self._note(IN, text)
         try:
             answer = parse_json(text)
@@ -84,17 +102,17 @@ class JsonRpc:
             )
         return answer["result"]
 
-    def _exchange(self, method: str, body: bytes) -> bytes:
+    def _exchange(self, method: str, body: bytes, within_s: float) -> bytes:
         """Send a question; returns the answer as far as it came, or the error's text if it is no HTTP."""
         head = (
             f"POST /json-rpc HTTP/1.1\r\nHost: {self._peer[0]}:{self._peer[1]}\r\nConnection: close\r\n"
             f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
         )
-        begun = time.monotonic()
+        patience = _Patience(within_s)
         while True:
             reached = False
             try:
-                with _Link(begun + self._call_s) as link:
+                with _Link(patience) as link:
                     link.connect(self._peer)
                     reached = True
                     link.sendall(head.encode() + body)
@@ -102,16 +120,18 @@ class JsonRpc:
                         answer.begin()
                         return answer.read(_MOST_BYTES)
             except TimeoutError:
-                where = f"within {self._call_s:g} s at {self._address}"
+                where = f"within {within_s:g} s at {self._address}"
                 if reached:
-                    self._unanswered_s = time.monotonic()
+                    if not method.startswith(_QUESTIONS):
+                        self._unanswered_s = time.monotonic()
                     raise DeviceTimeout(f"{self._name} did not answer {method} {where}; power-cycle it") from None
                 raise DeviceDisconnected(
                     f"{self._name}: no connection {where}; check its power, its cable and 'port'"
                 ) from None
             except OSError as error:
                 again = isinstance(error, ConnectionError) and (not reached or method.startswith(_REPEATABLE))
-                if not again or time.monotonic() - begun > RETRY_S:
+                patience.left_s -= _RETRY_PAUSE_S
+                if not again or patience.left_s < max(within_s - RETRY_S, 0):
                     raise DeviceDisconnected(
                         f"{self._name} cannot be reached at {self._address} ({one_line(error)}); check its power, its "
                         "cable and 'port'"
@@ -125,27 +145,51 @@ class JsonRpc:
             self._tap.note("tcp", direction, data)
 
 
-class _Link(socket.socket):
-    """A connection on which all waits together end at `ends_at`, a time of `time.monotonic`."""
+@dataclass(slots=True)
+class _Patience:
+    """Time that is left for the waits of a call."""
 
-    def __init__(self, ends_at: float) -> None:
+    left_s: float
+
+    def wait(self, ready: selectors.BaseSelector) -> None:
+        """Wait for a connection. It is looked at before time is judged, and of each look at most two steps count: that
+        this computer is late is not the box's silence. Raises `TimeoutError`."""
+        came = False
+        while not came:
+            begun = time.monotonic()
+            came = bool(ready.select(_STEP_S if self.left_s > 0 else 0))
+            if not came and self.left_s <= 0:
+                raise TimeoutError
+            self.left_s -= min(time.monotonic() - begun, 2 * _STEP_S)
+
+
+class _Link(socket.socket):
+    """A connection all of whose waits share one patience."""
+
+    def __init__(self, patience: _Patience) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_STREAM)
-        self._ends_at = ends_at
+        self.setblocking(False)
+        self._patience = patience
 
     def connect(self, address: Any) -> None:
-        self._limit()
-        super().connect(address)
+        error = self.connect_ex(address)
+        if error in (errno.EINPROGRESS, errno.EWOULDBLOCK):
+            self._wait(selectors.EVENT_WRITE)
+            error = self.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if error:
+            raise OSError(error, os.strerror(error))
 
-    def sendall(self, *arguments: Any) -> None:
-        self._limit()
-        super().sendall(*arguments)
+    def sendall(self, data: Any, *_: Any) -> None:
+        left = memoryview(data)
+        while left:
+            self._wait(selectors.EVENT_WRITE)
+            left = left[self.send(left) :]
 
     def recv_into(self, *arguments: Any) -> int:
-        self._limit()
+        self._wait(selectors.EVENT_READ)
         return super().recv_into(*arguments)
 
-    def _limit(self) -> None:
-        left_s = self._ends_at - time.monotonic()
-        if left_s <= 0:
-            raise TimeoutError
-        self.settimeout(left_s)
+    def _wait(self, event: int) -> None:
+        with selectors.DefaultSelector() as ready:
+            ready.register(self, event)
+            self._patience.wait(ready)

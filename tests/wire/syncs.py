@@ -184,7 +184,8 @@ class PulseBox:
         self.clock.sleep(seconds)
 
     def open(self, call_s: float = CALL_S, **config: Any) -> PulseStreamer:
-        made = PulseStreamerConfig.model_validate({"port": "emulated:sync", **config})
+        silence = {"silence": f"{2 * call_s} s"}  # each of its two questions gets as long as any other call
+        made = PulseStreamerConfig.model_validate({"port": "emulated:sync", **silence, **config})
         return PulseStreamer(made, Surroundings(self.clock, None, 0, {"sync": self.server.endpoint}), call_s)
 
 

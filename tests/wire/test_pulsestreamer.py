@@ -1,6 +1,7 @@
 """Pulse Streamer: its driver on the model's wire, the sequences for programs, and the count of sweeps."""
 
 import base64
+import selectors
 import socket
 import struct
 import threading
@@ -26,6 +27,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.interfaces.sync import HOLD_S
+from drivers.sync import pulsestreamer_rpc
 from drivers.sync.board import OutputPins
 from drivers.sync.pulsestreamer import PulseStreamer, PulseStreamerConfig
 from drivers.sync.pulsestreamer_rpc import JsonRpc
@@ -299,6 +301,40 @@ def test_no_program_starts_while_the_box_may_still_hear_a_call_that_it_has_not_a
         device.run()
 
 
+def test_a_program_asks_with_a_deadline_of_its_own() -> None:
+    with pulse_box() as box, box.open(call_s=1e4, silence="0.2 s") as device:
+        device.program((GATE,), 100_000)
+        device.run()
+        box.server.hang()
+        eventually(lambda: device.port_lost)
+        assert device._rpc.settles_in_s < 0, "a question that is heard late does no harm"
+        box.server.resume()
+
+
+@pytest.mark.parametrize("running", [False, True])
+def test_a_box_that_does_not_answer_is_closed_within_a_second_without_an_error(
+    running: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    waits_s: list[float] = []
+
+    def silent(method: str, body: bytes, within_s: float) -> bytes:
+        if threading.current_thread() is threading.main_thread():
+            waits_s.append(within_s)
+        raise DeviceTimeout("no answer")
+
+    with pulse_box() as box:
+        device = box.open()
+        device.program((GATE,), 1)
+        if running:
+            device.run()
+        with monkeypatch.context() as patched:
+            patched.setattr(device._rpc, "_exchange", silent)
+            device.close()
+        assert len(waits_s) == (3 if running else 2)
+        assert sum(waits_s) < 1
+        assert "could not be left safe: no answer" in caplog.text
+
+
 def test_a_program_whose_answer_is_lost_is_not_sent_again_and_nothing_plays() -> None:
     """A second `stream` could stop the first one in its midst, with the gate high."""
     faults = FaultScript()
@@ -353,6 +389,57 @@ def test_answers_in_all_forms_of_http_are_read_and_others_are_errors(pieces: lis
                 rpc.call("startNow")
             assert "\n" not in str(refused.value)
         thread.join()
+
+
+class WaitedTime:
+    """Time that passes only while something is waited for. In place of the module `time`, and of a selector."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def selector(self) -> selectors.BaseSelector:
+        time = self
+
+        class Selector(selectors.SelectSelector):
+            def select(self, timeout: float | None = None) -> list[Any]:
+                ready = super().select(0)
+                time.now_s += 0 if ready else timeout or 0
+                return ready
+
+        return Selector()
+
+
+@pytest.mark.parametrize(("listens", "connections"), [(True, 2), (False, 0)])
+def test_a_question_is_asked_twice_within_the_silence_of_a_box_and_then_the_box_is_lost(
+    listens: bool, connections: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passed = WaitedTime()
+    monkeypatch.setattr(pulsestreamer_rpc, "time", passed)
+    monkeypatch.setattr(pulsestreamer_rpc.selectors, "DefaultSelector", passed.selector)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        rpc = JsonRpc("box", f"127.0.0.1:{listener.getsockname()[1]}")
+        if not listens:
+            listener.close()
+        with pytest.raises(DeviceTimeout if listens else DeviceDisconnected):
+            rpc.ask("isStreaming", 0.3)
+        assert passed.now_s == pytest.approx(0.3, abs=0.021)
+        for _ in range(connections):
+            listener.accept()[0].close()
+
+
+def test_a_computer_that_is_late_does_not_take_the_box_for_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long its thread does not run."""
+    with pulse_box() as box:
+        rpc = JsonRpc("box", box.server.address, call_s=60.0)
+        monkeypatch.setattr(pulsestreamer_rpc, "time", late := WaitedTime())
+        monkeypatch.setattr(late, "monotonic", lambda: late.sleep(100.0) or late.now_s)
+        assert rpc.call("getTemperature") == 45
 
 
 # Config and sequences
