@@ -54,6 +54,19 @@ def pane_scene(height: int = 512, width: int = 512) -> Scene:
     return replace(_scene("pane", depth, np.full(depth.shape, WALL_ALBEDO)), pane=pane)
 
 
+def speck_scene(size: int, *, opaque: bool, height: int = 48, width: int = 512) -> Scene:
+    """A wall at about 4.5 m and before it, at 2.5 m, squares of `size` px: boards, or flakes that let half the light
+    pass."""
+    u, _ = _rays(height, width)
+    y, x = np.mgrid[0:height, 0:width]
+    there = (y % 16 < size) & (x % 24 < size) & (y > size)
+    wall, albedo = 4.5 + 0.5 * u, np.full(there.shape, WALL_ALBEDO)
+    if opaque:
+        return _scene("boards", np.where(there, 2.5, wall), albedo)
+    flakes = Pane(np.where(there, 2.5, np.inf).astype(np.float32), albedo=1.0, passes=0.5)
+    return replace(_scene("flakes", wall, albedo), pane=flakes)
+
+
 def _rays(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     y, x = np.mgrid[0:height, 0:width]
     return (x - (width - 1) / 2) / FOCAL_PX, (y - (height - 1) / 2) / FOCAL_PX

@@ -12,6 +12,9 @@ blocks around. The probability that the candidate is right is
 Positions x2_px and confidence2 are float32 (rows, columns), NaN and 0 where nothing stands out. LOG_ODDS are fitted to
 maps with a pane over a third of the picture and to maps without a pane. Light closer to a stripe than APART_PX plus
 LINE_SIGMAS standard deviations of the line counts as the stripe's own, so closer surfaces are not separated.
+
+A flake or a drop is a speck: a nearer answer for a few rows and columns, while the surface behind it is lit too. What a
+scan asks for is that surface, so there the two returns are exchanged (`behind_specks`).
 """
 
 from typing import Final, NamedTuple
@@ -25,9 +28,10 @@ from rig.estimate.joint.labels.grid import PER_PX, LabelGrid
 from rig.estimate.joint.place.pool import pool_row
 from rig.estimate.joint.second_return_blocks import BLOCK, HAZE_STEP, LEFT_OUT, Blocks, line_places, sum_blocks
 from rig.estimate.row.inputs import RowState, Sweep, fluxes_at, line_light
-from rig.estimate.row.neighbours import with_margin
+from rig.estimate.row.neighbours import SAME_PX, with_margin
 from rig.geometry.kernels import with_rays
-from rig.simd import Float32, Float64, Int16, Int32
+from rig.geometry.stripe_table import StripeTable
+from rig.simd import Bools, Float32, Float64, Int16, Int32
 from rig.simd.memory import address_of, aligned_zeros, keep_alive, load_float32, store_float32
 from rig.simd.vectors import LANES, larger_float, largest_float, square_root, zero_float32
 from rig.threads import RowWorkers, Work
@@ -48,6 +52,9 @@ LOG_ODDS: Final = -16.0, 0.4, 3.0
 """Factors of the log odds that a candidate is right, see the module."""
 _AROUND: Final = -(-(RING_PX + GAP_PX + 6) // LANES) * LANES
 """Zeros on either side of the pixels of distance, enough for a ring around a line of up to 6 px reach."""
+
+
+StripeArrays = tuple[Float32, Float32, Float32, Float32, Float32, Float32, Float32]
 
 
 class Candidates(NamedTuple):
@@ -343,3 +350,112 @@ def second_returns(
     for work in (begin, lambda first, last: move_seconds(reach, first, last, seconds), measure_moved, judge):
         of_asked(work)
     return x2_px, confidence2
+
+
+SPECK: Final = 4
+"""A speck is smaller than so many rows and columns: none of the answers that far around lies on its surface."""
+SPECK_SURE: Final = 0.5
+"""Least confidence of the second return behind a speck."""
+SPECK_AMONG: Final = 0.4
+"""Least share of the answers around a speck that must lie on the surface behind it."""
+SPECK_LIT: Final = 3.0
+"""Least log-likelihood ratio, from the row's own counts, of half the surface's light at the second return to none."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def find_specks(
+    distance: Float32, distance2: Float32, confidence2: Float32, signal: Float32, n_frames: Int32, ones: Float32,
+    expected: Float32, first_row: int, last_row: int, speck: Bools,
+) -> None:  # fmt: skip
+    """Fill speck (rows, columns), whether answers of rows first_row..last_row-1 are specks before a lit surface.
+
+    distance, distance2: of answer and second return from the far end in px, NaN where there is none; signal: of
+    `StripeTable`; ones, expected: of `Seconds`. The light is tested on the speck's own row, since the wall around a
+    small opaque thing is lit too. All float32 (rows, columns).
+    """
+    rows, columns = distance.shape
+    for y in range(first_row, last_row):
+        for c in range(columns):
+            speck[y, c] = False
+            behind = distance2[y, c]
+            if not (confidence2[y, c] >= SPECK_SURE and abs(behind) < abs(distance[y, c])):
+                continue
+            same, among, light, cells = 0, 0, 0.0, 0
+            for row in range(y - SPECK, y + SPECK + 1):
+                for column in range(c - SPECK, c + SPECK + 1):
+                    if not (0 <= row < rows and 0 <= column < columns):
+                        continue
+                    cells += 1
+                    edge = max(abs(row - y), abs(column - c)) == SPECK
+                    if edge and abs(distance[row, column] - distance[y, c]) <= SAME_PX:
+                        same += 1
+                    if abs(distance[row, column] - behind) <= SAME_PX:
+                        among += 1
+                        light += signal[row, column]
+                if same:
+                    break
+            if same or among < SPECK_AMONG * cells:
+                continue
+            usual = n_frames[c] * -np.expm1(-0.5 * light / among)
+            n, e = ones[y, c], max(expected[y, c], np.float32(1e-3))
+            speck[y, c] = n * np.log1p(usual / e) - usual > SPECK_LIT
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def exchange(
+    distance: Float32, distance2: Float32, speck: Bools, first_row: int, last_row: int, table: StripeArrays
+) -> None:
+    """Exchange both returns where rows first_row..last_row-1 have specks.
+
+    The answer gets the mean deviation, signal and haze of the answers around it on its new surface, and the smaller of
+    the second return's confidence and their mean confidence. table: the arrays of a `StripeTable`.
+    """
+    x_px, confidence, sd_px, signal, haze, x2_px, confidence2 = table
+    rows, columns = distance.shape
+    for y in range(first_row, last_row):
+        for c in range(columns):
+            if not speck[y, c]:
+                continue
+            number, sums = 0, np.zeros(4)
+            for row in range(max(y - SPECK, 0), min(y + SPECK + 1, rows)):
+                for column in range(max(c - SPECK, 0), min(c + SPECK + 1, columns)):
+                    if not speck[row, column] and abs(distance[row, column] - distance2[y, c]) <= SAME_PX:
+                        number += 1
+                        sums[0] += confidence[row, column]
+                        sums[1] += sd_px[row, column]
+                        sums[2] += signal[row, column]
+                        sums[3] += haze[row, column]
+            if number:
+                x_px[y, c], x2_px[y, c] = x2_px[y, c], x_px[y, c]
+                sure, confidence2[y, c] = confidence2[y, c], confidence[y, c]
+                confidence[y, c] = min(sure, np.float32(sums[0] / number))
+                sd_px[y, c], signal[y, c], haze[y, c] = sums[1] / number, sums[2] / number, sums[3] / number
+
+
+def behind_specks(
+    stripes: StripeTable, n_frames: Int32, grid: LabelGrid, room: SecondRoom, workers: RowWorkers
+) -> StripeTable:
+    """The table with both returns exchanged, in place, where the answer is a speck before a lit surface.
+
+    room: as `second_returns` has left it for these stripes.
+    """
+    assert stripes.x2_px is not None, "second returns have been looked for"
+    assert stripes.confidence2 is not None, "second returns have been looked for"
+    if not (stripes.confidence2 >= SPECK_SURE).any():
+        return stripes
+    distance, distance2 = (np.float32(x_px - grid.x_far) for x_px in (stripes.x_px, stripes.x2_px))
+    speck, (_, ones, expected, *_) = np.empty(distance.shape, np.bool_), room.seconds
+    table = (
+        stripes.x_px, stripes.confidence, stripes.x_sd_px, stripes.signal, stripes.haze, stripes.x2_px,
+        stripes.confidence2,
+    )  # fmt: skip
+
+    def find(first: int, last: int) -> None:
+        find_specks(
+            distance, distance2, stripes.confidence2, stripes.signal, n_frames, ones, expected, first, last, speck
+        )
+
+    workers.over(len(speck), find)
+    if speck.any():
+        workers.over(len(speck), lambda first, last: exchange(distance, distance2, speck, first, last, table))
+    return stripes

@@ -19,7 +19,7 @@ from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
 from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
 from rig.estimate.joint.place.place import new_places, place
 from rig.estimate.joint.place.places import Places
-from rig.estimate.joint.second_returns import SecondRoom, second_returns, second_room
+from rig.estimate.joint.second_returns import SecondRoom, behind_specks, second_returns, second_room
 from rig.estimate.joint.tables import JointTables
 from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, Ballots, collect, new_ballots, vote
@@ -82,7 +82,8 @@ class MapSolver:
         x2_px, confidence2 = second_returns(
             volume, tables.grid, tables.sweep, tables.light, first.x_px, room, self._workers
         )
-        return replace(first, x2_px=x2_px, confidence2=confidence2)
+        both = replace(first, x2_px=x2_px, confidence2=confidence2)
+        return behind_specks(both, volume.n_frames, tables.grid, room, self._workers)
 
     def stripes(self, volume: CountVolume, tables: JointTables, *, lesson: bool = False) -> StripeTable:
         """Stripe table of a map without second returns. lesson: only for learning; stripes are placed less finely."""

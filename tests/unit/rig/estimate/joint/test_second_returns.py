@@ -6,17 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate.joint.joint import Joint
 from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.second_return_blocks import BLOCK, sum_blocks
-from rig.estimate.joint.second_returns import second_light, second_returns, second_room
+from rig.estimate.joint.second_returns import find_specks, second_light, second_returns, second_room
 from rig.estimate.row.inputs import state_of, sweep_of
 from rig.estimate.row.likelihood import FLUX_MAX
 from rig.threads import RowWorkers
 from tests.reference.geometry import Geometry
-from tests.reference.made_scenes import pane_scene
+from tests.reference.made_scenes import pane_scene, speck_scene
 from tests.reference.working_point import POINTS, WorkingPoint
 from tests.unit.rig.estimate.joint.test_label_volume import known_model
-from tests.unit.small_maps import RIGS, Sweep, geometry_of, simulated
+from tests.unit.small_maps import RIGS, Sweep, assert_same, geometry_of, simulated
 
 WORKERS = RowWorkers(1)
 ROWS, COLUMNS = 24, 96
@@ -41,6 +42,15 @@ def seconds_of(sweep: Sweep, x_px, haze=0.14, threads=WORKERS, left=0.0, volume=
         array[:] = left
     volume = sweep.volume if volume is None else volume
     return second_returns(volume, grid, sweep_of(sweep.geometry), light, x_px.astype(np.float32), room, threads)
+
+
+@cache
+def specks(size, opaque, exposures=10):
+    """A sweep over small things before a wall, and the stripes that `joint` finds."""
+    g = Geometry.build(width=512, height=48, columns=384, **RIGS["left"])
+    point = WorkingPoint(speck_scene(size, opaque=opaque), POINTS["clear"], g)
+    sweep = Sweep(point, geometry_of(g), point.counts(exposures, 1), exposures)
+    return sweep, Joint(1).estimate(sweep.volume, sweep.geometry)
 
 
 def around(there):
@@ -85,6 +95,45 @@ def test_one_surface_has_no_second_return() -> None:
     x2_px, confidence2 = seconds_of(sweep, sweep.point.x_true)
     assert (confidence2[sweep.point.trusted] > SURE).mean() < 0.005
     assert (confidence2[np.isnan(x2_px)] == 0).all()
+
+
+def test_the_answer_is_the_wall_behind_a_flake_and_the_flake_the_second_return() -> None:
+    sweep, stripes = specks(3, opaque=False)
+    flake = np.isfinite(sweep.point.x_second) & np.isfinite(sweep.point.x_true)
+    right = np.abs(stripes.x_px - sweep.point.x_true) <= 1
+    assert right[flake].mean() > 0.6  # 0 of 186 without the exchange
+    exchanged = flake & right & np.isfinite(stripes.x2_px)
+    assert (np.abs(stripes.x2_px - sweep.point.x_second) <= 1)[exchanged].mean() > 0.98
+    assert (stripes.confidence[exchanged] > SURE).mean() > 0.98
+    for values in (stripes.x_sd_px, stripes.signal, stripes.haze):
+        assert np.isfinite(values[exchanged]).all()
+
+
+@pytest.mark.parametrize("size", [3, 5])
+def test_a_small_thing_that_lets_no_light_pass_stays_the_answer(size: int) -> None:
+    sweep, stripes = specks(size, opaque=True)
+    seen = np.isfinite(sweep.point.x_true)
+    assert (np.abs(stripes.x_px - sweep.point.x_true) <= 1)[seen].mean() > 0.999
+
+
+def test_specks_are_exchanged_alike_on_any_number_of_threads() -> None:
+    sweep, stripes = specks(3, opaque=False)
+    assert_same(Joint(3).estimate(sweep.volume, sweep.geometry), stripes)
+
+
+def test_a_wire_is_no_speck() -> None:
+    """Things that lead out of the square around an answer are kept, however narrow they are."""
+    shape, columns = (24, 48), np.arange(48)
+    distance = np.where(columns == 20, 60.0, 10.0) * np.ones(shape)
+    distance[9:12, 35:37] = 60.0
+    distance2 = np.where(distance > 50.0, 10.0, np.nan)
+    lit, found = np.ones(shape), np.empty(shape, np.bool_)
+    find_specks(
+        *(np.float32(a) for a in (distance, distance2, lit, lit)), np.full(48, 10, np.int32),
+        np.float32(8 * lit), np.float32(0.1 * lit), 0, 24, found,
+    )  # fmt: skip
+    assert found[9:12, 35:37].all()
+    assert found.sum() == 6
 
 
 def test_what_an_earlier_map_left_is_forgotten_where_nothing_is_searched() -> None:
