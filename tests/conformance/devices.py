@@ -88,7 +88,11 @@ def emulated_scanner(folder: Path, kind: str, make: Callable[[], DacModel]) -> I
             eventually(lambda: not device.status.moving or plugged.now_s() >= ends_s)
             clock.sleep(ends_s - plugged.now_s())
 
-        yield ScannerCase(device, lambda: model.moving(plugged.now_s()), let_pass)
+        def turning() -> bool:
+            clock.sleep(1e-4)  # a Helios begins a point after its first frame has come, which no driver can see
+            return model.moving(plugged.now_s())
+
+        yield ScannerCase(device, turning, let_pass)
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 
 There are two buffers, one playing and one pending, and a status polled with 03. A frame whose length is a multiple of
 the packet size never completes. Invalid frames are dropped silently, and so are frames within 100 ms after STOP. A
-frame without SINGLE repeats for ever. `DacModel` is the part that emulated scanner boards have in common; emulated
-worlds and tests read its record of the outputs.
+frame without SINGLE repeats for ever, and one that follows another begins with a longer point. `DacModel` is the part
+that emulated scanner boards have in common; emulated worlds and tests read its record of the outputs.
 """
 
 import struct
@@ -28,7 +28,7 @@ KEEP_S = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """Points played from start_s on, one every period_s, cut off at end_s.
+    """Points played from start_s on, one every period_s, cut off at end_s. The first one lasts longer by longer_s.
 
     command: float64 (n,), normalised drive. levels: uint8 (n, lines), colour outputs.
     """
@@ -38,6 +38,17 @@ class Played:
     period_s: float
     command: Array
     levels: NDArray[np.uint8]
+    longer_s: float = 0.0
+
+    def points_at(self, time_s: Array) -> NDArray[np.int64]:
+        """Indices of the points at times within the piece."""
+        at = np.floor((time_s - self.start_s - self.longer_s) / self.period_s + 1e-9).astype(np.int64)
+        return np.clip(at, 0, len(self.command) - 1)
+
+    def starts_s(self, points: NDArray[np.int64]) -> Array:
+        """Times at which points begin."""
+        at_s: Array = self.start_s + points * self.period_s + self.longer_s * (points > 0).astype(np.float64)
+        return at_s
 
 
 class DacHistory:
@@ -106,7 +117,7 @@ class DacHistory:
             for one in self._between(from_s - KEEP_S / 100, until_s):
                 high = one.levels[:, line] > 0
                 before = np.concatenate([[one.start_s - high_until < one.period_s / 2], high[:-1]])
-                at = one.start_s + np.flatnonzero(high & ~before) * one.period_s
+                at = one.starts_s(np.flatnonzero(high & ~before))
                 edges.append(at[(at >= from_s) & (at < min(until_s, one.end_s))].astype(np.float64))
                 high_until = one.end_s if high[-1] else -np.inf
         return np.concatenate(edges) if edges else np.empty(0)
@@ -115,8 +126,7 @@ class DacHistory:
         """Each piece played at the times: the piece, a mask of its times, and the indices of its points at them."""
         for one in self._between(time_s.min(initial=np.inf), time_s.max(initial=-np.inf)):
             inside = (time_s >= one.start_s) & (time_s < one.end_s)
-            at = np.floor((time_s[inside] - one.start_s) / one.period_s + 1e-9).astype(np.int64)
-            yield one, inside, np.clip(at, 0, len(one.command) - 1)
+            yield one, inside, one.points_at(time_s[inside])
 
     def _between(self, from_s: float, until_s: float) -> list[Played]:
         """The pieces that were played in [from_s, until_s], ascending."""
@@ -125,9 +135,9 @@ class DacHistory:
 
 def _joins(last: Played, played: Played) -> bool:
     """Whether two pieces can be kept as one: small ones of a long stream would be thousands to look through."""
-    whole_s = len(last.command) * last.period_s
+    whole_s = last.longer_s + len(last.command) * last.period_s
     seamless = max(abs(last.start_s + whole_s - at_s) for at_s in (last.end_s, played.start_s)) < 1e-3 * last.period_s
-    return seamless and last.period_s == played.period_s and whole_s < JOINED_S
+    return seamless and last.period_s == played.period_s and not played.longer_s and whole_s < JOINED_S
 
 
 DAC_STEPS = 4095
@@ -138,10 +148,13 @@ CENTRE = 0x800 / DAC_STEPS * 2 - 1
 class DacModel(UsbModel):
     """Base of the scanner boards. `history` records what the outputs did; times are the transport's."""
 
+    centre = CENTRE
+    """Drive at which the board itself puts the mirror."""
+
     def __init__(self, spec: DeviceSpec, *, commands: int, replies: int, points: int) -> None:
         """commands, replies, points: addresses of the endpoints that carry them."""
         self.spec = spec
-        self.history = DacHistory(CENTRE, lines=4)
+        self.history = DacHistory(self.centre, lines=4)
         self.deaf = False
         """Test knob: whether the firmware hangs, while its outputs play on."""
         self.points_endpoint = points
@@ -168,7 +181,7 @@ class DacModel(UsbModel):
         """Let the outputs fall to 0 V, which is the centre, since the power is gone."""
         self.advance(now_s)
         self._halt(now_s)
-        self.history.cut(now_s, CENTRE)
+        self.history.cut(now_s, self.centre)
 
     def moving(self, now_s: float) -> bool:
         """Whether points are being played."""
@@ -193,6 +206,10 @@ class DacModel(UsbModel):
 SYSTICK_HZ = 112_000_000
 BUFFER_POINTS = 4096
 STOP_DEAD_S = 0.1
+SEAM_S = 2.5e-6
+"""Time by which the first point of a frame that follows another lasts longer: 2 to 3 us, inferred. The firmware starts
+its timer anew only after it has sent that point's four colours (main.c:80-82, 251-254), 16 bits each at 22.4 MHz
+(main.c:378-379)."""
 BUS_BYTES_PER_S = 1.0e6
 """Approximate rate of full-speed USB: 4095 points take 28 ms."""
 
@@ -207,6 +224,7 @@ _SPEC = DeviceSpec(
     product_name="Helios Laser DAC",
     serial=None,
     speed="full",
+    release=0x0200,
     max_power_ma=150,
     alternates=(
         AlternateSpec(0, 0),
@@ -214,10 +232,10 @@ _SPEC = DeviceSpec(
             0,
             1,
             (
-                EndpointSpec(0x81, "bulk", 64),
-                EndpointSpec(FRAMES, "bulk", 64),
                 EndpointSpec(REPLIES, "interrupt", 32, 1),
                 EndpointSpec(COMMANDS, "interrupt", 32, 1),
+                EndpointSpec(0x81, "bulk", 64),
+                EndpointSpec(FRAMES, "bulk", 64),
             ),
         ),
     ),
@@ -230,7 +248,11 @@ class _Frame:
     levels: NDArray[np.uint8]
     period_s: float
     single: bool
-    duration_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """How long its points last, without a seam."""
+        return len(self.x) * self.period_s
 
 
 class HeliosModel(DacModel):
@@ -255,30 +277,37 @@ class HeliosModel(DacModel):
         self._armed = False
         self._received = b""
         self._arriving: tuple[int, float] | None = None
-        self._dead_until_s = -1.0
+        self._dead_until_s: float | None = None
+        self._alternate = 0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. Any other one stops it as STOP
-        does: colours low, and the mirror at the centre 100 ms later.
+        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. To leave it, even for itself,
+        does what STOP does: colours low, and the mirror at the centre 100 ms later. Transfers that are under way end.
         """
         self.advance(now_s)
-        if alternate == 1:
-            self._halt(now_s)
-        else:
+        if self._alternate == 1:
             self._stop(now_s)
+        self._alternate = alternate
         self._armed = alternate == 1
+        self._received, self._arriving = b"", None
+        self._replies.clear()
 
     def advance(self, now_s: float) -> None:
-        """Play on until now. Pending frames follow without a seam; single ones end with the colours low."""
+        """Play on until now. A pending frame follows, with a longer first point; a single one ends with the colours
+        low.
+        """
+        if self._dead_until_s is not None and now_s >= self._dead_until_s:
+            self._dead_until_s = None
+            self._armed = True
         while self._playing is not None and now_s >= self._ends_s:
-            following = self._pending
+            following, start_s = self._pending, self._ends_s + SEAM_S
             if following is None and not self._playing.single:
-                following = self._playing
-                self._record(following, self._ends_s)
+                following, start_s = self._playing, self._ends_s
+                self._record(following, start_s)
             self._playing = self._pending = None
             self._armed = True  # a frame that begins or ends makes the endpoint ready for the next one
             if following is not None:
-                self._play(following, self._ends_s)
+                self._play(following, start_s)
 
     def moving(self, now_s: float) -> bool:
         """Whether points are being played."""
@@ -295,15 +324,21 @@ class HeliosModel(DacModel):
             case 0x03:
                 free = self._pending is None
                 self._armed = self._armed or free
-                self._replies.append(bytes((0x83, free)))
+                self._reply(bytes((0x83, free)))
             case 0x04:
-                self._replies.append(b"\x84" + struct.pack("<I", self._version))
+                self._reply(b"\x84" + struct.pack("<I", self._version))
             case 0x05:
-                self._replies.append(b"\x85" + self._name.encode()[:30].ljust(31, b"\0"))
+                self._reply(b"\x85" + self._name.encode()[:31].ljust(31, b"\0"))
             case 0x06:
                 self._name = data[1:].split(b"\0")[0].decode("ascii", "replace")
             case 0xDE:
+                self._halt(now_s)
                 self.bootloader = self.gone = True
+
+    def _reply(self, data: bytes) -> None:
+        """Offer a reply. It is lost if the host has not yet fetched the one before."""
+        if not self._replies:
+            self._replies.append(data)
 
     def _take_points(self, data: bytes, now_s: float) -> int | None:
         if not self._armed:
@@ -324,18 +359,19 @@ class HeliosModel(DacModel):
     def _take(self, data: bytes, now_s: float) -> None:
         pps, points, flags = struct.unpack("<HHB", data[-5:]) if len(data) >= 5 else (0, 0, 0)
         sound = 0 < points <= BUFFER_POINTS and len(data) == 7 * points + 5
-        if not sound or now_s < self._dead_until_s or self.drop_next > 0:
+        if not sound or self._dead_until_s is not None or self.drop_next > 0:
             self.drop_next = max(0, self.drop_next - 1)
             self.refused += 1
             return
         frame = self._decode(data[:-5], max(pps, 7), flags)
         if self._playing is None or flags & 1:
-            self._halt(now_s)
-            self._record(frame, now_s)
-            self._play(frame, now_s)
+            start_s = now_s + frame.period_s  # the timer starts, and its first tick brings the first point
+            self._halt(start_s)
+            self._record(frame, start_s)
+            self._play(frame, start_s)
         else:
             self._pending = frame
-            self._record(frame, self._ends_s)
+            self._record(frame, self._ends_s, SEAM_S)
 
     def _decode(self, data: bytes, pps: int, flags: int) -> _Frame:
         raw = np.frombuffer(data, np.uint8).reshape(-1, 7).astype(np.uint16)
@@ -343,7 +379,7 @@ class HeliosModel(DacModel):
         y = (raw[:, 1] & 0xF) << 8 | raw[:, 2]
         period_s = (SYSTICK_HZ // pps + 1) / SYSTICK_HZ / (1 + self._clock_error)
         command = (x if self._axis == "x" else y) / DAC_STEPS * 2 - 1
-        return _Frame(command, raw[:, 3:].astype(np.uint8), period_s, bool(flags & 2), len(raw) * period_s)
+        return _Frame(command, raw[:, 3:].astype(np.uint8), period_s, bool(flags & 2))
 
     def _play(self, frame: _Frame, start_s: float) -> None:
         self._playing, self._ends_s = frame, start_s + frame.duration_s
@@ -351,13 +387,15 @@ class HeliosModel(DacModel):
         self.played += 1
 
     def _stop(self, now_s: float) -> None:
-        """Blank at once, refuse frames for 100 ms, and centre the mirror then."""
+        """Blank at once, refuse frames for 100 ms, and centre the mirror then. A second STOP begins the 100 ms anew."""
         self._halt(now_s)
+        self.history.cut(now_s)
         self._dead_until_s = now_s + STOP_DEAD_S
         self.history.cut(self._dead_until_s, CENTRE)
 
-    def _record(self, frame: _Frame, start_s: float) -> None:
-        self.history.play(Played(start_s, start_s + frame.duration_s, frame.period_s, frame.x, frame.levels))
+    def _record(self, frame: _Frame, start_s: float, longer_s: float = 0.0) -> None:
+        end_s = start_s + longer_s + frame.duration_s
+        self.history.play(Played(start_s, end_s, frame.period_s, frame.x, frame.levels, longer_s))
 
     def _halt(self, now_s: float) -> None:
         if self._playing is not None:
