@@ -10,10 +10,9 @@ from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, LimitExceed
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
 from drivers.scanners.dac_scanner import PointSlice
 from drivers.scanners.lasercube import LaserCube, encode
-from sim_backend.wire.firmware.helios import CENTRE
 from sim_backend.wire.serve.usb_model import Stall
 from tests.wire import scanners
-from tests.wire.lasercube import BLUE, COMMANDS, GREEN, RED, REPLIES, SAMPLES, LaserCubeModel
+from tests.wire.lasercube import BLUE, CENTRE, COMMANDS, GREEN, RED, REPLIES, SAMPLES, LaserCubeModel
 from tests.wire.scanners import LaserCubeRecorder, cosine, opened, play, plug
 
 STEP = 2 / 4095
@@ -58,7 +57,7 @@ def test_the_model_keeps_its_ring_and_stands_at_the_centre_while_the_output_is_o
         model.advance(4.0)
         sent(command, 4.0)
         assert model.history.command(np.array([4.1]))[0] == CENTRE
-    codes = [sent(command, 5.0)[1] for command in (b"\x99", b"\x80\x02", b"\x82" + (41_000).to_bytes(4, "little"))]
+    codes = [sent(command, 5.0)[1] for command in (b"\x99", b"\x80\x02", b"\x82" + (65_000).to_bytes(4, "little"))]
     assert codes == [0xFF, 1, 1]
 
 
@@ -221,7 +220,7 @@ def test_a_reply_left_by_another_program_is_dropped() -> None:
     model = LaserCubeModel()
     model._replies.append(bytes(64))
     with opened("lasercube", model) as (device, _):
-        assert device._dac.firmware == (0, 12)  # type: ignore[attr-defined]
+        assert device._dac.firmware == (3, 7)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
