@@ -65,6 +65,18 @@ _UNSUPPORTED = (-200197, -200452)
 Value = TypeVar("Value")
 
 
+def attached_cards() -> list[tuple[str, str]]:
+    """Name and model of each card that NI-DAQmx on this computer knows; none without the package or NI-DAQmx."""
+    try:
+        system, errors = import_module("nidaqmx.system"), import_module("nidaqmx.errors")
+    except ImportError:
+        return []
+    try:
+        return [(card.name, card.product_type) for card in system.System.local().devices]
+    except errors.Error:
+        return []
+
+
 class NiCard:
     """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread."""
 

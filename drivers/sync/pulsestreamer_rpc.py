@@ -3,6 +3,7 @@
 The box answers at port 8050 under /json-rpc (docs/reference/devices/pulsestreamer.md). As in Swabian's clients, each
 call has a connection of its own, so that one that hangs holds up no other, least of all one that takes the gate low.
 The number in an answer is not compared with that of the question: newer clients that do so refuse the box's answers.
+Boxes are found by a datagram, as the vendor's client finds them.
 """
 
 import errno
@@ -13,7 +14,11 @@ import math
 import os
 import selectors
 import socket
+import struct
+import sys
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +44,29 @@ _STEP_S = 0.01
 """Time from one look at what has arrived to the next."""
 _MOST_BYTES = 65_536
 """Longer than any answer."""
+EVERYBODY = (("255.255.255.255", 12_345), ("239.255.255.82", 12_345))
+"""Addresses at which boxes are asked who is there: the broadcast, and a multicast group."""
+_WHO, _HERE = b"PS-DISCOVERY", b"PS-DISCOVERY-REPLY"
+
+
+def discover(wait_s: float = 0.5, to: Sequence[tuple[str, int]] = EVERYBODY) -> Iterator[tuple[str, str]]:
+    """Numeric address and serial number of each box that answers within `wait_s`. The multicast goes out at every
+    network card, the broadcast only at the default one. Ends early, without an error, if the socket fails."""
+    ends_at = time.monotonic() + wait_s
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        asker.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        for index, _ in socket.if_nameindex():
+            card = struct.pack("!I", index) if sys.platform == "win32" else struct.pack("=8xi", index)
+            for address in to:
+                with suppress(OSError):  # the card is not connected
+                    asker.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, card)
+                    asker.sendto(_WHO, address)
+        while (left_s := ends_at - time.monotonic()) > 0:
+            asker.settimeout(left_s)
+            datagram, sender = asker.recvfrom(2048)
+            with suppress(ValueError, KeyError, TypeError):  # from something else
+                if datagram.startswith(_HERE):
+                    yield sender[0], str(parse_json(datagram.removeprefix(_HERE))["serial"])
 
 
 class JsonRpc:

@@ -36,7 +36,8 @@ def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Findi
 
 
 def devices() -> "list[Attached]":
-    """List USB devices that a driver knows, Ether Dreams and serial ports, without opening any (`rig devices`)."""
+    """List USB devices that a driver knows, NI cards, Ether Dreams, Pulse Streamers and serial ports, without opening
+    any (`rig devices`)."""
     from rig.devices.doctor import attached
 
     return attached()

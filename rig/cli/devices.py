@@ -22,10 +22,11 @@ def doctor_command(
 
 
 def devices_command() -> Answer:
-    """List what is attached: USB devices that a driver knows, Ether Dreams on the network, and serial ports."""
+    """List what is attached: USB devices that a driver knows, NI cards, Ether Dreams and Pulse Streamers on the
+    network, and serial ports."""
     found = api.devices()
     lines = [f"{one.address:<32}{one.what}" for one in found]
-    said = "\n".join(lines or ["no known USB device, no Ether Dream and no serial port is attached"])
+    said = "\n".join(lines or ["no USB device, card, network device or serial port that a driver knows is attached"])
     return Answer({"devices": [asdict(one) for one in found]}, lambda: print(said))
 
 

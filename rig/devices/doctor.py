@@ -26,7 +26,9 @@ from drivers.ring import BlockRing
 from drivers.scanners.etherdream_line import broadcasts
 from drivers.scanners.helios import HELIOS
 from drivers.scanners.lasercube import LASERCUBE
+from drivers.scanners.nidaq_card import attached_cards
 from drivers.spads.spb_usb_setup import USB_IDS
+from drivers.sync.pulsestreamer_rpc import discover
 from drivers.transports.usb_device import attached as attached_usb
 from rig.config.models import RigConfig
 from rig.devices.calibration_use import NEXT, identity_of, refusals
@@ -305,17 +307,21 @@ class Attached:
 
 
 def attached() -> list[Attached]:
-    """List USB devices that a driver knows, Ether Dreams that broadcast, then serial ports. Opens nothing."""
+    """List USB devices that a driver knows, NI cards that NI-DAQmx knows, Ether Dreams that broadcast, Pulse Streamers
+    that answer, then serial ports. Opens nothing."""
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
         for one in attached_usb(wanted)
     ]
+    found += [Attached(name, f"nidaq: {model}", "nidaq") for name, model in attached_cards()]
     for address, heard in dict(broadcasts()).items():
         found.append(Attached(address, f"etherdream: MAC {heard.mac}, hardware {heard.hardware}", "etherdream"))
+    for address, serial in dict(discover()).items():
+        found.append(Attached(address, f"pulsestreamer: serial {serial}", "pulsestreamer"))
     for port in list_ports.comports():
-        serial = f", serial={port.serial_number}" if port.serial_number else ""
-        found.append(Attached(port.device, f"serial port: {port.description}{serial}", None))
+        number = f", serial={port.serial_number}" if port.serial_number else ""
+        found.append(Attached(port.device, f"serial port: {port.description}{number}", None))
     return found
 
 

@@ -13,7 +13,8 @@ import pytest
 from drivers.lasers.obis import ObisConfig
 from rig import api
 from rig.config.overrides import configure
-from rig.devices.doctor import Finding
+from rig.devices import doctor
+from rig.devices.doctor import Attached, Finding
 from rig.errors import PlanError
 from sim_backend.wire.emulated_world import EmulatedWorld
 from sim_backend.wire.firmware.helios import GREEN
@@ -145,6 +146,16 @@ def test_devices_lists_what_is_attached_and_opens_nothing(rig: Rig) -> None:
     assert ran.code == 0
     for one in json.loads(ran.out)["devices"]:
         assert set(one) == {"address", "what", "kind"}
+
+
+def test_devices_lists_cards_and_boxes_of_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "attached_cards", lambda: [("Dev1", "PCIe-6363")])
+    monkeypatch.setattr(doctor, "broadcasts", lambda: [])
+    monkeypatch.setattr(doctor, "discover", lambda: iter([("192.168.1.10", "00:26:32:F0:3B:1B")]))
+    assert [one for one in api.devices() if one.kind in ("nidaq", "pulsestreamer")] == [
+        Attached("Dev1", "nidaq: PCIe-6363", "nidaq"),
+        Attached("192.168.1.10", "pulsestreamer: serial 00:26:32:F0:3B:1B", "pulsestreamer"),
+    ]
 
 
 def test_the_doctor_finds_a_simulated_rig_fit(rig: Rig, small: Path, tmp_path: Path) -> None:

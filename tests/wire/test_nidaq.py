@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nidaqmx.errors import DaqNotFoundError
 from pydantic import ValidationError
 
 from drivers import errors
@@ -262,6 +263,20 @@ def test_an_outside_clock_and_trigger_make_point_0_and_what_does_not_come_is_tol
         assert device.status.fault is None
         starts = bench.model.history.rising(BLUE, begun_s, bench.now_s())
         assert starts == pytest.approx([begun_s, begun_s + 0.05], abs=1e-4)
+
+
+def test_cards_that_the_driver_of_ni_knows_are_listed_and_without_it_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = SimpleNamespace(devices=[SimpleNamespace(name="Dev1", product_type="PCIe-6363")])
+    monkeypatch.setattr("nidaqmx.system.System.local", lambda: found)
+    assert nidaq_card.attached_cards() == [("Dev1", "PCIe-6363")]
+
+    def missing() -> None:
+        raise DaqNotFoundError("no NI-DAQmx")
+
+    monkeypatch.setattr("nidaqmx.system.System.local", missing)
+    assert nidaq_card.attached_cards() == []
+    monkeypatch.setitem(sys.modules, "nidaqmx.system", None)
+    assert nidaq_card.attached_cards() == []
 
 
 # What goes wrong

@@ -30,7 +30,7 @@ from drivers.interfaces.sync import HOLD_S
 from drivers.sync import pulsestreamer_rpc
 from drivers.sync.board import OutputPins
 from drivers.sync.pulsestreamer import PulseStreamer, PulseStreamerConfig
-from drivers.sync.pulsestreamer_rpc import JsonRpc
+from drivers.sync.pulsestreamer_rpc import JsonRpc, discover
 from drivers.sync.pulsestreamer_sequence import (
     IDLE_POLL_S,
     MAX_STEPS,
@@ -440,6 +440,23 @@ def test_a_computer_that_is_late_does_not_take_the_box_for_silent(monkeypatch: p
         monkeypatch.setattr(pulsestreamer_rpc, "time", late := WaitedTime())
         monkeypatch.setattr(late, "monotonic", lambda: late.sleep(100.0) or late.now_s)
         assert rpc.call("getTemperature") == 45
+
+
+def test_boxes_that_answer_a_question_to_all_are_found_among_others() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
+        box.bind(("127.0.0.1", 0))
+
+        def answer() -> None:
+            question, asker = box.recvfrom(2048)
+            assert question == b"PS-DISCOVERY"
+            for said in (b"{}", b"PS-DISCOVERY-REPLY", b"PS-DISCOVERY-REPLY[]", b'PS-DISCOVERY-REPLY{"serial": "F0"}'):
+                box.sendto(said, asker)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        assert next(discover(PATIENCE_S, [box.getsockname()])) == ("127.0.0.1", "F0")
+        thread.join()
+    assert list(discover(0.01, [("127.0.0.1", 9)])) == []
 
 
 # Config and sequences
