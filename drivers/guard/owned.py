@@ -62,9 +62,18 @@ RETRY_S = 0.1
 class Owned:
     """One device of the rig, with a lane for its ordinary jobs and another for jobs that must not wait for them."""
 
-    def __init__(self, slot: str, config: dict[str, Any], ports: dict[str, str], tap: dict[str, Any] | None) -> None:
-        """tap: fields of the `TapFile` that records its port; None: nothing is recorded."""
+    def __init__(
+        self,
+        slot: str,
+        config: dict[str, Any],
+        ports: dict[str, str],
+        tap: dict[str, Any] | None,
+        on_silence: Callable[[DeviceError], object],
+    ) -> None:
+        """tap: fields of the `TapFile` that records its port; None: nothing is recorded. on_silence: called, on any
+        thread, if an armed laser answers nothing any more."""
         self.slot = slot
+        self._on_silence = on_silence
         self.device: Any = None
         self.armed = False
         """Whether this is a laser that is to be disarmed if the application cannot go on."""
@@ -94,6 +103,7 @@ class Owned:
             limits = self.device.limits
             about["limits"] = [limits.min_power_w, limits.max_power_w]
             about["gate_only"] = self.device.gate_only
+            about["changed"] = self.device.changed
         else:
             about["resolution_s"] = self.device.resolution_s
         return about
@@ -117,11 +127,13 @@ class Owned:
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
             self.emits = (self.emits or verb == "arm") and verb not in ("pause", "disarm")
+            device.watch(self._on_silence if self.armed else None)
         match verb:
             case "status":
                 return asdict(device.status)
             case "arm":
                 device.arm(*arguments)
+                return device.changed
             case "program":
                 pulses, repeats = arguments
                 device.program([Pulse(*pulse) for pulse in pulses], repeats)

@@ -2,8 +2,8 @@
 
 The main thread never touches a device. It reads messages, looks at the application every 10 ms and queues jobs for the
 threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is
-stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or stops
-answering; or when the guard is told to end. In a trip all outputs of the gate go low; at the same time the laser is
+stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or falls
+silent; or when the guard is told to end. In a trip all outputs of the gate go low; at the same time the laser is
 paused and, if it was armed, disarmed. An application that was stopped or took no frames is killed, unless it makes its
 rig safe in time. The ports are closed when the guard ends. If frames stop because the gate's program has ended, the
 laser is only paused. "The gate" in this module is the sync source, which drives the gate.
@@ -19,7 +19,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from typing import Any
@@ -41,6 +41,10 @@ SIGN_OF_LIFE_S = 0.05
 POLL_S = 1.0
 """Time between questions to an armed laser about interlock and faults: at most 1 s
 (docs/reference/hardware.md, Lasers on a serial line)."""
+ALIVE_S = 0.1
+"""Time from the last question to an armed laser to the next one, which only shows that its firmware still runs. With
+the kind's `silence`, `drivers.transports.dialogue.AGAIN_S` and the time to lower the gate, the light of a laser that
+hangs is off within 500 ms."""
 END_CHECK_S = 0.2
 """Time between checks whether the gate's program has ended, while an application at work is late with its frames."""
 GATE_FIRST_S = 0.1
@@ -70,7 +74,7 @@ class GuardProcess:
         self._check_until: float | None = None
         self._next_end_check = 0.0
         self._silence_noted = False
-        self._next_poll = 0.0
+        self._next_poll = self._next_alive = 0.0
         self._terminated = False
 
     def run(self) -> int:
@@ -123,7 +127,7 @@ class GuardProcess:
         self._watch.limits = GuardLimits(**message["limits"])
         for slot, config in message["open"].items():
             try:
-                owned = Owned(slot, config, message["ports"], message["tap"])
+                owned = Owned(slot, config, message["ports"], message["tap"], self._trip)
             except Exception as error:  # a config that is unusable here is reported to the application
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue
@@ -255,10 +259,21 @@ class GuardProcess:
 
     def _poll_laser(self, now: float) -> None:
         laser = self._owned.get("laser")
-        if laser is None or not laser.armed or now < self._next_poll or not laser.lane.idle:
+        if self._tripped is not None or laser is None or not laser.armed or not laser.lane.idle:
             return
-        self._next_poll = now + POLL_S
-        laser.lane.do(lambda: self._ask_laser(laser))
+        if now >= self._next_poll:
+            self._next_poll = now + POLL_S
+            laser.lane.do(lambda: self._ask_laser(laser))
+        elif now >= self._next_alive:
+            laser.lane.do(lambda: self._check_alive(laser))
+        else:
+            return
+        self._next_alive = now + ALIVE_S
+
+    def _check_alive(self, laser: Owned) -> None:
+        """Ask the laser, on its lane, for a sign of life. Its silence trips by itself (`LineLaser.watch`)."""
+        with suppress(DeviceError):  # what else is wrong, the next question about faults shows
+            laser.device.check_alive()
 
     def _ask_laser(self, laser: Owned) -> None:
         """Ask the laser, on its lane, about interlock and faults; a second time if an answer is missing or garbled."""
@@ -267,7 +282,7 @@ class GuardProcess:
             try:
                 status = device.status
             except DeviceError as error:
-                if device.state is DeviceState.CLOSED:  # by an earlier job of the lane
+                if device.state is DeviceState.CLOSED or self._tripped is not None:  # by an earlier job, or by silence
                     return
                 if attempt:
                     self._trip(error)
@@ -301,6 +316,7 @@ class GuardProcess:
         """Queue an attempt to make a device safe, for each device that is `due`."""
         with self._trip_lock:
             due = [owned for owned in self._owned.values() if owned.due]
+            due.sort(key=lambda owned: owned.slot != "sync")  # the gate is the faster one, and ends the light alone
             for owned in due:
                 owned.trying = True
         for owned in due:
@@ -367,23 +383,25 @@ class Rescue:
                 self._off[slot] = partial(configured_port, slot, config, ports), kind.off(config)
         self._outcome: dict[str, str] = {}
 
-    def run(self, slots: set[str], armed: bool) -> str:
+    def run(self, slots: set[str], armed: bool, changed: Sequence[str] = ()) -> str:
         """Make the devices of these slots safe; returns the outcome as text for a message. armed: whether the laser was
-        armed.
+        armed. changed: the laser's settings that the guard had changed (`LineLaser.changed`), as far as is known.
         """
-        threads = [threading.Thread(target=self._save, args=(slot, armed), daemon=True) for slot in slots]
+        threads = [threading.Thread(target=self._save, args=(slot, armed, changed), daemon=True) for slot in slots]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
         return ", ".join(f"{slot}: {self._outcome[slot]}" for slot in sorted(slots)) or "no device was open"
 
-    def _save(self, slot: str, armed: bool) -> None:
+    def _save(self, slot: str, armed: bool, changed: Sequence[str]) -> None:
         try:
             if armed and slot in self._off:
                 with suppress(Exception):  # opening the device is tried all the same, and shows what is wrong
                     self._switch_off(slot)
             with _once_free(self._create[slot]) as device:
+                if isinstance(device, LineLaser):
+                    device.adopt(changed)
                 make_safe(device, disarm=armed)
                 dark = not (isinstance(device, LineLaser) and device.gate_only)
             self._outcome[slot] = "made safe by the application" if dark else "NOT switched off, only its gate ends it"

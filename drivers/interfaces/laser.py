@@ -2,10 +2,11 @@
 
 import logging
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Real
 
-from drivers.errors import DeviceFault, InterlockOpen, LimitExceeded
+from drivers.errors import DeviceError, DeviceFault, InterlockOpen, LimitExceeded
 from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
 
 _log = logging.getLogger(__name__)
@@ -66,6 +67,24 @@ class LineLaser(Device):
         """Ask the laser. Raises `WrongState` after close. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
+
+    def watch(self, on_silence: Callable[[DeviceError], object] | None) -> None:
+        """Have `on_silence` called, on any thread, as soon as the laser answers a question later than it ever should
+        and says nothing when asked once more. None: no longer. The guard does this while the laser is armed. Does
+        nothing for a laser that cannot be asked.
+        """
+
+    def check_alive(self) -> None:
+        """Ask the laser what it answers fastest. Raises `DeviceTimeout` if it is silent, after it has told `watch`. May
+        be called from any thread. Does nothing for a laser that cannot be asked."""
+
+    @property
+    def changed(self) -> list[str]:
+        """Commands that put back what this driver has changed in the laser's settings; `close` sends them."""
+        return []
+
+    def adopt(self, changed: Sequence[str]) -> None:
+        """Take over the settings that another process has changed, so that `close` puts them back."""
 
     def arm(self, power_w: float) -> None:
         """Set the power and enable emission under the gate. Light may come later (`status.warming_up`).

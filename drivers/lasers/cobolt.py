@@ -24,13 +24,16 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
 from drivers.registry import Kind, Surroundings, alone, config_of, quantity
 from drivers.transports.dialogue import DONE, FLAG, NUMBER, Dialogue, LineTiming
+from drivers.units import Seconds
 
 _log = logging.getLogger(__name__)
 
@@ -51,11 +54,15 @@ _POWER_STEP_MW = 0.1
 class CoboltFraming:
     """The form of a Cobolt's commands and replies."""
 
-    ping = "?"
+    ping = quickest = "?"
 
     def greets(self, reply: str) -> bool:
         """Whether the reply is `OK`."""
         return reply == DONE
+
+    def asks(self, command: str) -> bool:
+        """Whether it is a question."""
+        return "?" in command
 
     def encode(self, command: str) -> bytes:
         """The command's bytes, terminated by CR."""
@@ -181,6 +188,9 @@ class CoboltConfig(SerialLaserConfig):
     """Config of a Cobolt 06-01 laser."""
 
     kind: Literal["cobolt"] = "cobolt"
+    silence: Annotated[Seconds, Field(ge=0.05, le=2)] = 0.2
+    """As in `SerialLaserConfig`. No source says how soon a Cobolt answers a question; this is twice the time that it
+    needs between two."""
 
 
 class CoboltLaser(SerialLaser):
@@ -283,11 +293,11 @@ class CoboltLaser(SerialLaser):
         try:
             self._enable(power_w)
             self._require_no_stop()
-        except DeviceError:
+            self._armed = True
+        except BaseException:  # an interrupt too
             with suppress(DeviceError):  # the first error is the one to report
                 self._darken(on=True)
             raise
-        self._armed = True
 
     def _enable(self, power_w: float) -> None:
         """Keep the laser dark until the gate is known to control the light; only then set the power."""

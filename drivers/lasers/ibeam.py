@@ -69,17 +69,19 @@ class IbeamFraming:
     """The form of an iBeam's commands and replies with echo and prompt off: lines, of which `[OK]` is the last."""
 
     ping = "show serial"
+    quickest = "status laser"
 
     def __init__(self) -> None:
-        self.echo = self.prompt = False
-        """Whether they were on when the port was opened."""
+        self.changed: list[str] = []
+        """Commands that put echo and prompt back to what they were when the port was opened."""
 
     def prepare(self, port: SerialPort) -> None:
         """Switch echo and prompt off, whatever state they are in, and note that state. If the laser answers each
         command with the reply to the one before, it is told to switch off, and `DeviceFault` is raised."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
-        self.echo, self.prompt = b"echo off" in echoed, _PROMPT in said + echoed
+        found = {"echo on": b"echo off" in echoed, "prom on": _PROMPT in said + echoed}
+        self.changed = [command for command, was_on in found.items() if was_on]
         for command in ("prom off", "talk usual", self.ping):
             _say(port, command)
         if b"SN:" in _say(port, ""):
@@ -91,6 +93,10 @@ class IbeamFraming:
     def greets(self, reply: str) -> bool:
         """Whether the reply tells a serial number."""
         return SERIAL.fullmatch(reply) is not None
+
+    def asks(self, command: str) -> bool:
+        """Whether it is a question."""
+        return command.startswith(("sta", "sh", "version"))
 
     def encode(self, command: str) -> bytes:
         """The command's bytes, with CRLF at the end."""
@@ -129,7 +135,7 @@ class IbeamLaser(SerialLaser):
 
     def __init__(self, line: Dialogue, framing: IbeamFraming, name: str, limits: LaserLimits) -> None:
         super().__init__(name, line, limits)
-        self._framing = framing
+        self._left.put_back = framing.changed
         self._told_on = False
         self._refused: set[str] = set()
         """Questions that this unit does not know; a refusal takes most of a second."""
@@ -213,11 +219,11 @@ class IbeamLaser(SerialLaser):
             if mode != _GATED:
                 raise DeviceFault(f"{self._name}: its light is under {mode}, not only the gate; power-cycle it")
             self._require_no_stop()
+            self._armed = True
         except BaseException:  # an interrupt too
             with suppress(DeviceError):  # the first error is the one to report
                 self._switch_off()
             raise
-        self._armed = True
 
     def _enable(self) -> None:
         """Switch on with all levels at 0, under the gate."""
@@ -284,12 +290,8 @@ class IbeamLaser(SerialLaser):
         self._told_on = False  # first: it is no fault that it goes off
         self._line.tell_and_check("laser off", "status laser", SWITCH, "OFF".__eq__)
 
-    def _make_safe(self) -> None:
-        super()._make_safe()
-        with suppress(DeviceError):  # the laser is off, and that is what a close is for
-            for was_on, command in ((self._framing.echo, "echo on"), (self._framing.prompt, "prom on")):
-                if was_on:
-                    _say(self._line.port, command)
+    def _put_back(self, command: str) -> None:
+        _say(self._line.port, command)
 
 
 def _levels(reply: str) -> dict[int, float]:

@@ -77,6 +77,9 @@ class ObisFraming:
     """The form of an OBIS's commands and replies. channel: the laser's slot in a Remote, which is a controller
     for several lasers; None without one."""
 
+    quickest = "SYST:STAT?"
+    """Goes to the laser itself; a Remote answers `*IDN?` without it."""
+
     def __init__(self, channel: int | None) -> None:
         self._suffix = "" if channel is None else str(channel)
         self._handshake: bool | None = None
@@ -97,6 +100,10 @@ class ObisFraming:
         self._handshake = reply == "ON"
         return True
 
+    def asks(self, command: str) -> bool:
+        """Whether it is a query."""
+        return command.endswith("?")
+
     def encode(self, command: str) -> bytes:
         """The bytes of a command, with CRLF at the end. Behind a Remote they contain the laser's channel."""
         addressed = command if command == _HANDSHAKE else _ADDRESSED.sub(rf"\g<1>{self._suffix}", command)
@@ -104,7 +111,7 @@ class ObisFraming:
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
         """The reply; "" if its `OK` is missing. Without handshake a set command has none and counts as done."""
-        if not command.endswith("?"):
+        if not self.asks(command):
             return read_line() if self._handshake else DONE
         reply = read_line()
         acknowledged = reply == "ON" if self._handshake is None else self._handshake
@@ -245,14 +252,14 @@ class ObisLaser(SerialLaser):
                 self._await_ready()
                 self._told_on = True
                 self._switch("SOUR:AM:STAT", "ON")
-        except DeviceError:
+            if self._stopped:  # a pause from another thread overtook the ON
+                self._switch_off()
+            self._require_no_stop()
+            self._armed = True
+        except BaseException:  # an interrupt too
             with suppress(DeviceError):  # the first error is the one to report
                 self._switch_off()
             raise
-        if self._stopped:  # a pause from another thread overtook the ON
-            self._switch_off()
-        self._require_no_stop()
-        self._armed = True
 
     def _prepare(self) -> None:
         """Switch off, and set up the laser so that only the gate controls the light and power-up brings none."""
@@ -266,6 +273,8 @@ class ObisLaser(SerialLaser):
                     if setting == _AUTOSTART:
                         raise
                     self._found[setting] = "OFF"  # a unit without a prompt
+                if self._found[setting] == "ON":
+                    self._left.put_back.append(f"{setting} ON")
             if setting == _AUTOSTART or self._found[setting] == "ON":
                 self._switch(setting, "OFF")
         self._line.tell_and_check("SOUR:AM:EXT DIG", "SOUR:AM:SOUR?", _MODE, _DIGITAL.__contains__)
@@ -320,11 +329,8 @@ class ObisLaser(SerialLaser):
                 raise DeviceFault(f"{self._name} still emits after OFF; turn its key off")
             self._clock.sleep(_DARK_POLL_S)
 
-    def _make_safe(self) -> None:
-        super()._make_safe()
-        for setting in (name for name, found in self._found.items() if found == "ON"):
-            with suppress(DeviceError):  # the laser is off, and that is what a close is for
-                self._switch(setting, "ON")
+    def _put_back(self, command: str) -> None:
+        self._switch(*command.split(" "))
 
     def _bits(self) -> int:
         return int(self._line.ask_surely("SYST:STAT?", BITS), 16)

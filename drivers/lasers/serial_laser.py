@@ -9,7 +9,8 @@ import logging
 import os
 import re
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Annotated, TypeVar
 
 from pydantic import Field
@@ -27,10 +28,11 @@ from drivers.errors import (
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
-from drivers.transports.dialogue import Dialogue, Framing, LineTiming
-from drivers.transports.endpoints import resolve
+from drivers.transports.dialogue import Dialogue, Framing, LineTiming, OnSilence
+from drivers.transports.endpoints import EMULATED_PREFIX, resolve
+from drivers.transports.serial_device import SerialDevice
 from drivers.transports.serial_port import BAUD, SerialPort
-from drivers.units import Watts
+from drivers.units import Seconds, Watts
 
 
 class SerialLaserConfig(KindConfig):
@@ -44,17 +46,26 @@ class SerialLaserConfig(KindConfig):
     """Serial number of the laser; any other laser is refused. None: any laser will do."""
     baud: Annotated[int, Field(ge=9600, le=921_600)] = BAUD
     """Bits per second of the port, where the laser or the adapter before it is set to another rate than usual."""
+    silence: Annotated[Seconds, Field(ge=0.05, le=2)] = 0.15
+    """Longest time without an answer to a question of the guard, while the laser is armed. Then the guard asks once
+    more, and 0.1 s later it switches the light off. A laser emulated at a port `emulated:` has 1.5 s."""
 
+
+EMULATED_SILENCE_S = 1.5
+"""The same for an emulated laser, which shares this computer's processors and may itself be late."""
 
 _log = logging.getLogger(__name__)
 
 _ANY = re.compile(".*")
 
 
-class _Light:
-    """Whether a laser may shine. This does not refer to the laser, which may be deleted without a close."""
+class _Left:
+    """What a laser leaves behind if it is deleted without a close. This does not refer to the laser itself."""
 
-    may_shine = False
+    def __init__(self) -> None:
+        self.may_shine = False
+        self.put_back: list[str] = []
+        """Commands that put back settings which the driver has changed."""
 
 
 OFF_TIMES = 3
@@ -62,22 +73,30 @@ OFF_TIMES = 3
 second may come too soon after a reply to be heard."""
 
 
-def _forgotten(name: str, port: SerialPort, off: bytes, light: _Light, process: int) -> None:
-    """Close the port of a laser that is closed or deleted; first switch it off by the bytes `off` if it may shine. Only
-    logs errors. process: number of the laser's process; in another one, which was forked from it, nothing is done."""
+def _forgotten(name: str, line: Dialogue, off: bytes, left: _Left, process: int) -> None:
+    """Close the port of a laser that is closed or deleted; first switch it off by the bytes `off` if it may shine, and
+    put its settings back. Only logs errors. process: number of the laser's process; in another one, which was forked
+    from it, nothing is done."""
     if os.getpid() != process:
         return
-    if light.may_shine:
-        try:
-            port.write_again(off, OFF_TIMES)
+    try:
+        if left.may_shine:
+            line.port.write_again(off, OFF_TIMES)
             _log.warning("%s: was left armed; it was told to switch off", name)
-        except DeviceError as error:
-            _log.error("%s: was left armed and may shine, turn its key off (%s)", name, error)
-    port.close()
+        for command in left.put_back:
+            line.port.write_again(line.encode(command), 1)
+    except DeviceError as error:
+        trouble = "may shine, turn its key off" if left.may_shine else "its settings could not be put back"
+        _log.error("%s: was left armed and %s (%s)", name, trouble, error)
+    line.port.close()
 
 
-class SerialLaser(LineLaser):
-    """A laser that communicates through `self._line`."""
+class SerialLaser(SerialDevice, LineLaser):
+    """A laser on a serial line."""
+
+    _line: Dialogue
+    silence_s = SerialLaserConfig.model_fields["silence"].default
+    """`SerialLaserConfig.silence`, in seconds."""
 
     def __init__(self, name: str, line: Dialogue, limits: LaserLimits) -> None:
         super().__init__(name)
@@ -85,7 +104,7 @@ class SerialLaser(LineLaser):
         self._line = line
         self._limits = limits
         self._armed = False
-        self._light = _Light()
+        self._left = _Left()
         self._forgotten: weakref.finalize[..., SerialLaser] | None = None
         self._stopped = False
         """Whether pause or disarm was called since arm began, which other threads may do."""
@@ -93,11 +112,11 @@ class SerialLaser(LineLaser):
     def arm(self, power_w: float) -> None:
         """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
         self._stopped = False
-        before, self._light.may_shine = self._light.may_shine, True
+        before, self._left.may_shine = self._left.may_shine, True
         try:
             super().arm(power_w)
         except (LimitExceeded, InterlockOpen, WrongState):
-            self._light.may_shine = before or self._stopped
+            self._left.may_shine = before or self._stopped
             raise
 
     def pause(self) -> None:
@@ -114,7 +133,7 @@ class SerialLaser(LineLaser):
 
     def _note_dark(self) -> None:
         if self._stopped:  # else another thread has begun to arm
-            self._light.may_shine = False
+            self._left.may_shine = False
 
     def ask(self, command: str) -> str:
         """Send a raw command and return the laser's reply, also if it is a refusal.
@@ -123,8 +142,31 @@ class SerialLaser(LineLaser):
         `DeviceError` is raised.
         """
         self._require("ask", *OPEN_STATES)
-        self._light.may_shine = True
+        self._left.may_shine = True
         return self._line.ask(command, _ANY)
+
+    def send(self, command: str) -> None:
+        """See `SerialDevice`."""
+        self._left.may_shine = True
+        super().send(command)
+
+    def watch(self, on_silence: OnSilence | None) -> None:
+        """See `LineLaser`."""
+        self._line.watch(on_silence, self.silence_s)
+
+    def check_alive(self) -> None:
+        """See `LineLaser`."""
+        self._require("check_alive", *OPEN_STATES)
+        self._line.check_alive()
+
+    @property
+    def changed(self) -> list[str]:
+        """See `LineLaser`."""
+        return list(self._left.put_back)
+
+    def adopt(self, changed: Sequence[str]) -> None:
+        """See `LineLaser`."""
+        self._left.put_back = list(dict.fromkeys([*self._left.put_back, *changed]))
 
     def _require_no_stop(self) -> None:
         """Raise `WrongState` if a pause or disarm has come while arming: the laser must then stay dark."""
@@ -136,15 +178,22 @@ class SerialLaser(LineLaser):
         """From the laser's least power to the smaller of its own maximum and the config's."""
         return self._limits
 
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port is gone, found out without sending anything. May be called from any thread."""
-        return self._line.port.lost
-
     def watch_for_end(self, off: bytes) -> None:
         """Have the laser told to switch off if it is deleted, or Python ends in the normal way, before `close`, or if
         `close` could not pause it. A failure is only logged. off: bytes that switch it off in any state."""
-        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line.port, off, self._light, os.getpid())
+        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line, off, self._left, os.getpid())
+
+    def _make_safe(self) -> None:
+        # A laser that cannot be paused keeps its settings: some of them keep it dark at its next power-up.
+        put_back, self._left.put_back = self._left.put_back, []
+        super()._make_safe()
+        for command in put_back:
+            with suppress(DeviceError):  # the laser is off, and that is what a close is for
+                self._put_back(command)
+
+    def _put_back(self, command: str) -> None:
+        """Send one of the commands of `changed` to a laser that is off."""
+        self._line.tell(command)
 
     def _do_close(self) -> None:
         if self._forgotten is not None:
@@ -183,6 +232,7 @@ def open_laser(
                 f"{make} laser: nothing on port {config.port} answers as one; check 'port', power and cable"
             ) from None
         laser = identify(line)
+        laser.silence_s = EMULATED_SILENCE_S if config.port.startswith(EMULATED_PREFIX) else config.silence
         laser.watch_for_end(off)
         return laser
     except BaseException:

@@ -26,6 +26,7 @@ from drivers.registry import Kind, Surroundings, alone, config_of, quantity
 from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
+from drivers.transports.serial_device import SerialDevice
 from drivers.transports.serial_port import SerialPort
 from drivers.units import Hertz, Seconds
 
@@ -147,8 +148,10 @@ class PrawnDoConfig(BoardConfig):
     marker_output: Annotated[int, Field(ge=0, le=15, description="output that marks the SPAD's records")] = 2
 
 
-class PrawnDo(SyncBoard):
+class PrawnDo(SerialDevice, SyncBoard):
     """A PrawnDO board. Opening it first takes all outputs low, whatever the board was doing."""
+
+    _line: PrawnDoLine
 
     def __init__(self, config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> None:
         super().__init__("PrawnDO")
@@ -200,11 +203,6 @@ class PrawnDo(SyncBoard):
     def resolution_s(self) -> float:
         """One cycle of the clock: 10 ns with the board's own clock."""
         return 1 / self._board.clock_hz
-
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port is gone, found out without sending anything. May be called from any thread."""
-        return self._line.port.lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""

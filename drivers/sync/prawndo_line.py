@@ -122,6 +122,12 @@ class PrawnDoLine:
             self.port.write(f"{before}\n{command}\n{after}\n".encode())
             return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
+    def send(self, command: str) -> None:
+        """Send a command and wait for no answer. One that comes is not between the lines of nonsense of another."""
+        with self.lock:
+            self._pay_debt()
+            self.port.write(f"\n{command}\n".encode())
+
     def command(self, command: str) -> None:
         """Send a command that is answered with `ok`. Raises `DeviceFault` for any other answer."""
         lines = self.transact(command)

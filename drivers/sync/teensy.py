@@ -27,6 +27,7 @@ from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, q
 from drivers.sync.board import SyncBoard
 from drivers.sync.teensy_line import DONE, REPLY_S, STATUS, TRIES, TeensyLine
 from drivers.transports.endpoints import resolve
+from drivers.transports.serial_device import SerialDevice
 from drivers.transports.serial_port import SerialPort
 from drivers.units import Seconds
 
@@ -95,8 +96,10 @@ class TeensyConfig(KindConfig):
     ] = WATCHDOG_S
 
 
-class Teensy(SyncBoard):
+class Teensy(SerialDevice, SyncBoard):
     """A Teensy. Opening it first takes all outputs low, whatever the board was doing."""
+
+    _line: TeensyLine
 
     def __init__(self, config: TeensyConfig, surroundings: Surroundings, reply_s: float = REPLY_S) -> None:
         super().__init__("Teensy")
@@ -150,11 +153,6 @@ class Teensy(SyncBoard):
     def resolution_s(self) -> float:
         """One tick: 10 ns."""
         return self._board.tick_ns * 1e-9
-
-    @property
-    def port_lost(self) -> bool:
-        """Whether the port is gone, found out without sending anything. May be called from any thread."""
-        return self._line.port.lost
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """4294967295 if `pulses` fit the memory once, else 0."""

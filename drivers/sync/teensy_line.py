@@ -93,6 +93,10 @@ class TeensyLine:
             raise CommandRefused(f"{self._name} refuses {shown}: {answer[:80]}; see docs/reference/teensy.md")
         raise ProtocolError(f"{self._name} answered {shown} with {answer[:40]!r}; check its firmware")
 
+    def send(self, command: str) -> None:
+        """Send a command without a tag, and wait for no answer: that has no tag either, and is dropped."""
+        self._write(command.encode("ascii", "replace"))
+
     def status(self) -> SyncStatus:
         """State of the program, and the outputs as the board reads them back."""
         answer = self.ask("status", STATUS, TRIES)

@@ -7,6 +7,11 @@ is sent whose answer is known, and then the command again. The form of a make's 
 
 Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
 released it; with a plain lock the thread that wants to switch the laser off could wait for ever.
+
+The guard has to know soon that a firmware hangs. So a dialogue can be *watched*: then the answer to a question must
+begin within the kind's `silence`. If it does not, one more question is sent, the one that this firmware answers
+fastest, and if nothing at all comes within `AGAIN_S`, the device is silent. Commands that set something may take the
+usual time, since a firmware may be slow to store it.
 """
 
 import re
@@ -16,7 +21,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.clock import Clock, now_s
-from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import CommandRefused, DeviceError, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
 
@@ -42,7 +47,14 @@ DONE = "OK"
 FLAG = re.compile(r"[01]")
 NUMBER = re.compile(r"[+-]?\d{1,9}(\.\d{1,9})?([eE][+-]?\d{1,2})?")
 _DONE = re.compile(DONE)
+_ANY = re.compile(".*")
 _ATTEMPTS = 3
+AGAIN_S = 0.1
+"""Time for any sign of life after the question that is sent to a silent device. The answer to the question before it is
+one too."""
+
+OnSilence = Callable[[DeviceError], object]
+"""Function that is called when a watched device falls silent, on the thread that asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +81,13 @@ class Framing(Protocol):
     def greets(self, reply: str) -> bool:
         """Whether `reply` answers the ping."""
 
+    @property
+    def quickest(self) -> str:
+        """The question that the device itself, and not only a controller before it, answers fastest."""
+
+    def asks(self, command: str) -> bool:
+        """Whether a command only asks for something."""
+
     def encode(self, command: str) -> bytes:
         """The bytes of a command."""
 
@@ -92,6 +111,32 @@ class Dialogue:
         self._timing = timing
         self._lock = FairLock()
         self._quiet_since_s = now_s(clock)
+        self._silence_s = timing.reply_s
+        self._on_silence: OnSilence | None = None
+        self._silent = False
+        self._unread = False
+        """Whether a reply may come that nobody waits for."""
+
+    def watch(self, on_silence: OnSilence | None, silence_s: float) -> None:
+        """Watch the dialogue from now on: a question unanswered for `silence_s` shows that the device may hang. If it
+        does, `on_silence` is called, and what was asked raises `DeviceTimeout` at once. None: watch no longer."""
+        self._on_silence, self._silence_s = on_silence, silence_s
+
+    def check_alive(self) -> None:
+        """Ask the question that is answered fastest. Raises `DeviceTimeout` if the device is silent."""
+        self.ask(self._framing.quickest, _ANY)
+
+    def encode(self, command: str) -> bytes:
+        """The bytes of a command."""
+        return self._framing.encode(command)
+
+    def send(self, command: str) -> None:
+        """Send a command and wait for no reply. What the device says all the same is dropped before the next command.
+        Raises `DeviceTimeout` if the port takes nothing, or `DeviceDisconnected`."""
+        with self._lock:
+            self._write(command)
+            self._quiet_since_s = now_s(self.clock)
+            self._unread = True
 
     def connect(self) -> None:
         """Synchronise with the device. Raises `DeviceTimeout` or `ProtocolError` if nothing of this make answers.
@@ -112,14 +157,14 @@ class Dialogue:
     def ask(self, command: str, form: re.Pattern[str]) -> str:
         """The reply to a query. form: the pattern of the whole reply. Errors as in `tell`."""
         with self._lock:
-            reply = ""
+            reply, self._silent = "", False
             for attempt in range(_ATTEMPTS):
-                if attempt:
+                if attempt or (self._unread and self._framing.asks(command)):
                     self._resync(self._timing.quiet_s)
                 try:
                     reply = self._once(command)
                 except DeviceTimeout:
-                    if attempt == _ATTEMPTS - 1:
+                    if attempt == _ATTEMPTS - 1 or self._silent:
                         raise
                     continue
                 if form.fullmatch(reply):
@@ -169,21 +214,48 @@ class Dialogue:
 
     def _once(self, command: str) -> str:
         """Send one command and return its reply."""
+        on_silence = self._on_silence
+        hasty = on_silence is not None and self._framing.asks(command)
+        line_s = self._silence_s if hasty else self._timing.reply_s
+        self._write(command)
+        try:
+            return self._framing.read(
+                command, lambda: self.port.read_line(b"\n", line_s).decode("ascii", "replace").strip()
+            )
+        except DeviceTimeout:
+            if on_silence is None or self._lives():
+                raise
+            self._silent = True
+            silence = DeviceTimeout(
+                f"{self.name} answered nothing to {command!r} within {line_s:g} s, nor when it was asked once more; "
+                "turn its key off, then check its cable and power-cycle it"
+            )
+            on_silence(silence)
+            raise silence from None
+        finally:
+            self._quiet_since_s = now_s(self.clock)
+
+    def _write(self, command: str) -> None:
+        """Send one command once the device is ready for it."""
         passed_s = now_s(self.clock) - self._quiet_since_s
         self.clock.sleep(self._timing.gap_s - passed_s)
         if self.port.reset_input().strip():  # a late or unwanted reply, of which more may still come
             self.port.drain(self._timing.quiet_s, self._timing.drain_s)
         self.port.write(self._framing.encode(command))
+
+    def _lives(self) -> bool:
+        """Whether a device that left a question unanswered says anything when it is asked once more. What it says may
+        be the late answer, so both are dropped before the next command."""
+        self.port.write(self._framing.encode(self._framing.quickest))
         try:
-            reply_s = self._timing.reply_s
-            return self._framing.read(
-                command, lambda: self.port.read_line(b"\n", reply_s).decode("ascii", "replace").strip()
-            )
-        finally:
-            self._quiet_since_s = now_s(self.clock)
+            self.port.read_line(b"\n", AGAIN_S)
+        except DeviceTimeout:
+            return False
+        return True
 
     def _resync(self, quiet_s: float) -> None:
         """Drop late replies, then send the ping, whose answer is known."""
+        self._unread = False
         for attempt in range(_ATTEMPTS):
             self.port.drain(quiet_s, self._timing.drain_s)
             ping = self._framing.ping
@@ -192,6 +264,6 @@ class Dialogue:
                 if self._framing.greets(self._once(ping)) and not self.port.drain(quiet_s, self._timing.drain_s):
                     return
             except DeviceTimeout:
-                if attempt == _ATTEMPTS - 1:
+                if attempt == _ATTEMPTS - 1 or self._silent:
                     raise
         raise ProtocolError(f"{self.name} does not answer {ping!r} as it should; check 'port' and cable")

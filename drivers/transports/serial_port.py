@@ -36,6 +36,8 @@ except ImportError:  # no such module, and no such error, on Windows
 _FOREIGN = (serial.SerialException, OSError, _termios_error)
 _SLICE_S = 0.02
 """One wait inside pyserial: the granularity of deadlines, in seconds."""
+_MOST_WAIT_S = 2 * _SLICE_S
+"""Longest time that one wait counts, however late it ends: what holds this process up may hold up the bytes too."""
 _WRITE_S = 1.0
 """Longest time for all bytes of a write. 1 s is 11 520 characters at 115 200 baud."""
 BAUD = 115_200
@@ -118,14 +120,18 @@ class SerialPort:
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
         """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`, and keeps the part received
         for the next call; `ProtocolError` if no line ends within 64 KiB; `DeviceDisconnected`.
+
+        If the host was held up, the deadline is later, and what has arrived meanwhile is read before it counts.
         """
-        ends_at = now_s(self.clock) + deadline_s
-        searched = 0
+        searched, waited_s = 0, 0.0
         while (end := self._received.find(terminator, searched)) < 0:
             if len(self._received) > _MAX_LINE_BYTES:
                 raise ProtocolError(f"{self._name} sent {len(self._received)} bytes without an end of line: noise")
             searched = max(0, len(self._received) - len(terminator) + 1)
-            if not self._receive_some() and now_s(self.clock) >= ends_at:
+            begun_s = now_s(self.clock)
+            came = self._receive_some()
+            waited_s += min(now_s(self.clock) - begun_s, _MOST_WAIT_S)
+            if waited_s >= deadline_s and not came and not self._receive_some(0):
                 raise DeviceTimeout(
                     f"{self._name} did not send a whole line within {deadline_s:g} s on {self.path} "
                     f"({len(self._received)} bytes came); check its power and cable"
@@ -182,9 +188,10 @@ class SerialPort:
             return DeviceBusy(f"{where} is held by another program; close that program and try again")
         return DeviceNotFound(f"{where} cannot be opened as a serial port ({one_line(error)}); correct 'port'")
 
-    def _receive_some(self) -> bool:
+    def _receive_some(self, least: int = 1) -> bool:
+        """Receive what has come; waits up to a slice for `least` bytes. Returns whether anything came."""
         with self._translated():
-            data = self._port.read(max(1, self._port.in_waiting))
+            data = self._port.read(max(least, self._port.in_waiting))
         self._note(IN, data)
         self._received += data
         return bool(data)

@@ -5,10 +5,12 @@ import errno
 import os
 from typing import Self
 
+import pytest
 import serial
 
 from drivers.clock import NS_PER_S, Clock
 from drivers.transports.endpoints import Endpoint
+from drivers.transports.serial_port import SerialPort
 from sim_backend.wire.serve.serial import SerialServer
 from sim_backend.wire.serve.wire_server import WireServer
 from tests.wire.faults import Faulty
@@ -101,8 +103,8 @@ class EmulatedPort:
         return len(self.received)
 
     def read(self, size: int) -> bytes:
-        """At most `size` bytes; none if nothing comes within one slice of waiting."""
-        ends_ns = self.clock.now_ns() + round(_SLICE_S * NS_PER_S)
+        """At most `size` bytes; none if nothing comes within one slice of waiting. For 0 bytes it does not wait."""
+        ends_ns = self.clock.now_ns() + round(_SLICE_S * NS_PER_S) * bool(size)
         while not self.in_waiting and self.clock.now_ns() < ends_ns:
             self.clock.sleep(_TURN_S)
         with self._wire.lock:
@@ -128,3 +130,21 @@ class EmulatedPort:
         if self._end >= 0:
             os.close(self._end)
             self._end = -1
+
+
+HELD_UP_S = 5.0
+
+
+def hold_up(port: SerialPort, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the host stand still, as on a busy machine, each time it begins to wait for bytes; they come meanwhile."""
+    emulated = port._port
+    read = emulated.read
+
+    def late(size: int) -> bytes:
+        if size and not emulated.in_waiting:
+            clock.sleep(HELD_UP_S)
+            return b""
+        data: bytes = read(size)
+        return data
+
+    monkeypatch.setattr(emulated, "read", late)

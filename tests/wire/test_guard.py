@@ -144,7 +144,7 @@ def test_what_cannot_be_opened_is_told_device_by_device(port: str, told: str, ri
 
 @pytest.mark.parametrize("channel", [None, 2])
 def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int | None) -> None:
-    model = ObisModel(cdrh_delay_s=0.0, channel=channel)
+    model = ObisModel(cdrh_delay_s=0.0, channel=channel, autostart=True, prompt=True)
     with SerialServer(model) as server:
         config = ObisConfig.model_validate({"port": server.path, "max_power": "50 mW", "channel": channel})
         with Guard(laser=config) as guard:
@@ -162,6 +162,7 @@ def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int 
         said = model.commands[before:]
         assert said.index(f"SOUR{address}:AM:STAT OFF") < said.index("SYST:COMM:HAND?")  # the first one of opening it
         assert not any(command.startswith("SOUR:AM:STSOUR") for command in said)
+        assert (model.autostart, model.prompt) == (True, True)  # the guard had told the application what it changed
 
 
 def test_an_error_of_any_class_comes_through_as_what_it_is() -> None:

@@ -1,10 +1,8 @@
 """The iBeam driver on an emulated wire; what all serial lasers share is in test_serial_lasers.py."""
 
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -12,8 +10,7 @@ import pytest
 from drivers.clock import now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceNotFound, ProtocolError, WrongState
 from drivers.interfaces import LineLaser
-from drivers.lasers import ibeam
-from drivers.lasers.ibeam import IbeamConfig, IbeamFraming
+from drivers.lasers.ibeam import KIND, IbeamConfig, IbeamFraming
 from sim_backend.wire.firmware.ibeam import BIAS, NORMAL, UNKNOWN, IbeamModel
 from tests.wire.lasers import USUAL, open_ibeam, overtaken_arm, wire
 
@@ -78,8 +75,8 @@ def test_an_answer_is_read_up_to_ok_and_only_warnings_and_errors_refuse(answer: 
 
 def test_commands_and_the_bytes_of_off_end_with_crlf() -> None:
     assert IbeamFraming().encode("laser on") == b"laser on\r\n"
-    assert ibeam.KIND.off is not None
-    off = ibeam.KIND.off(IbeamConfig.model_validate(USUAL))
+    assert KIND.off is not None
+    off = KIND.off(IbeamConfig.model_validate(USUAL))
     assert off == b"laser off\r\n"
     model = IbeamModel(lag_gap_s=0.049)
     model.shine(0.05)
@@ -285,37 +282,6 @@ def test_arm_waits_until_it_is_on_and_a_pause_ends_the_wait() -> None:
         assert not model.state_on
     with opened(Cold(on_delay_s=11.0)) as device, pytest.raises(DeviceFault, match="not on 10 s after 'laser on'"):
         device.arm(0.05)
-
-
-class Strike:
-    """Interrupts the n-th line of the driver that is run."""
-
-    def __init__(self, n: int) -> None:
-        self.left = n
-
-    def __call__(self, frame: FrameType, event: str, argument: object) -> Any:
-        if event == "line" and frame.f_code.co_filename == ibeam.__file__:
-            self.left -= 1
-            if self.left == 0:
-                sys.settrace(None)
-                raise KeyboardInterrupt
-        return self
-
-
-def test_an_interrupt_at_any_line_of_the_driver_leaves_it_dark() -> None:
-    at, struck = 0, True
-    while struck:  # at every 29th line, until there is none
-        at, model = at + 29, IbeamModel()
-        strike, before = Strike(at), sys.gettrace()
-        with suppress(KeyboardInterrupt), opened(model) as device:
-            sys.settrace(strike)
-            try:
-                device.arm(0.05)
-            finally:
-                sys.settrace(before)
-        struck = strike.left == 0
-        assert not model.state_on
-    assert at > 300
 
 
 def test_one_that_was_power_cycled_hears_off_but_must_be_opened_again() -> None:

@@ -1,7 +1,9 @@
 """The OBIS driver through real pyserial against a model of its firmware: bytes of docs/reference/devices/obis.md, and
 every trap."""
 
+import gc
 from contextlib import closing
+from unittest.mock import Mock
 
 import pytest
 
@@ -320,6 +322,33 @@ def test_only_a_setting_that_was_changed_is_put_back_at_the_close(autostart: boo
         assert [command for command in sets(model) if command == "SYST:AUT ON"] == ["SYST:AUT ON"] * autostart
         if autostart:
             assert model.commands.index("SYST:AUT ON") > off[-1]
+
+
+@pytest.mark.parametrize("channel", [None, 2])
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_laser_that_is_deleted_without_a_close_gets_its_settings_back(paused: bool, channel: int | None) -> None:
+    model = ObisModel(autostart=True, prompt=True, cdrh_delay_s=0.0, channel=channel)
+    with wire(model) as (_, surroundings):
+        laser = open_obis(surroundings, channel=channel)
+        laser.arm(0.05)
+        assert (model.autostart, model.prompt, model.emitting) == (False, False, True)
+        if paused:
+            laser.pause()
+        del laser
+        gc.collect()
+    assert (model.autostart, model.prompt, model.state_on) == (True, True, False)
+
+
+def test_a_laser_that_cannot_be_paused_keeps_autostart_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = ObisModel(autostart=True, cdrh_delay_s=0.0)
+    with wire(model) as (_, surroundings):
+        laser = open_obis(surroundings)
+        laser.arm(0.05)
+        monkeypatch.setattr(laser, "_do_pause", Mock(side_effect=DeviceFault("it shines")))
+        with pytest.raises(DeviceFault, match="it shines"):
+            laser.close()
+    assert not model.autostart  # else it would shine again after the power-cycle that ends its light
+    assert not model.state_on
 
 
 def test_a_setting_that_cannot_be_put_back_does_not_stop_the_close() -> None:

@@ -1,15 +1,18 @@
 """What every laser on a serial line does, whatever its make: limits, identity, lost ports, faults on the wire."""
 
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from types import FrameType
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from drivers.clock import VirtualClock, now_s
+from drivers.clock import SystemClock, VirtualClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceNotFound, DeviceTimeout, LimitExceeded
 from drivers.guard.process import OFF_TIMES
 from drivers.interfaces import LineLaser
@@ -19,8 +22,8 @@ from drivers.lasers import obis as obis_framing
 from drivers.lasers.cobolt import CoboltConfig
 from drivers.lasers.ibeam import IbeamConfig
 from drivers.lasers.obis import ObisConfig
-from drivers.lasers.serial_laser import SerialLaserConfig
-from drivers.registry import kinds, lookup
+from drivers.lasers.serial_laser import EMULATED_SILENCE_S, SerialLaser, SerialLaserConfig
+from drivers.registry import Surroundings, kinds, lookup
 from drivers.transports.dialogue import FairLock
 from drivers.transports.serial_port import AGAIN_S
 from rig.config.files import load_config
@@ -32,7 +35,9 @@ from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
+from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import USUAL, Babble, Silent, bring_up, eventually, open_cobolt, open_ibeam, open_obis, wire
+from tests.wire.serial_wire import HELD_UP_S, hold_up
 
 
 @dataclass(frozen=True)
@@ -238,3 +243,126 @@ def test_trap_a_tenth_of_a_second_was_too_little_for_a_reply() -> None:
     assert all(one.USUAL_TIMING.reply_s >= 1.0 for one in (cobolt_framing, ibeam_framing, obis_framing))
     assert ibeam_framing.USUAL_TIMING.gap_s >= 0.05
     assert cobolt_framing.USUAL_TIMING.gap_s >= 0.1
+
+
+class Strike:
+    """Interrupts the n-th line of a driver that is run."""
+
+    def __init__(self, driver: Any, n: int) -> None:
+        self.file, self.left = driver.__file__, n
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> Any:
+        if event == "line" and frame.f_code.co_filename == self.file:
+            self.left -= 1
+            if self.left == 0:
+                sys.settrace(None)
+                raise KeyboardInterrupt
+        return self
+
+
+@each_dialect
+def test_an_interrupt_at_any_line_of_arm_leaves_it_dark_also_without_with(make: Make) -> None:
+    at, struck = 0, True
+    while struck:  # at every 19th line, until there is none
+        at, model = at + 19, make.model()
+        with wire(model) as (server, surroundings):
+            laser = make.open(surroundings)
+            strike, before = Strike(sys.modules[make.config.__module__], at), sys.gettrace()
+            sys.settrace(strike)
+            try:
+                laser.arm(0.05)
+            except KeyboardInterrupt:
+                with server.lock:
+                    model.tick(now_s(surroundings.clock) + 60.0)  # whatever was pending
+                    assert not model.emitting
+            finally:
+                sys.settrace(before)
+            struck = strike.left == 0
+            laser.close()
+    assert at > 100
+
+
+# The sign of life that the guard asks for. Times are those of the emulated wire's clock.
+
+
+HANG_S = 0.36
+"""From the last answer of a laser that hangs to its silence, without the time between two questions: 0.15 or 0.2 s, 0.1
+s, and two waits of the port."""
+
+
+@contextmanager
+def watched(make: Make, model: Any = None) -> Iterator[tuple[Any, Any, SerialLaser, list[Exception]]]:
+    """(server, clock, laser that emits, its silences)."""
+    with wire(model or make.model()) as (server, surroundings):
+        laser = make.open(surroundings)
+        assert isinstance(laser, SerialLaser)
+        bring_up(laser, surroundings.clock)
+        laser.silence_s = make.config.model_fields["silence"].default
+        silences: list[Exception] = []
+        laser.watch(silences.append)
+        yield server, surroundings.clock, laser, silences
+        server.resume()
+        server.faults = None
+        laser.close()
+
+
+@each_dialect
+@pytest.mark.parametrize("verb", ["check_alive", "status"])
+def test_a_firmware_that_hangs_is_silent_within_its_kind_s_time(make: Make, verb: str) -> None:
+    with watched(make) as (server, clock, laser, silences):
+        server.hang()
+        began_s = now_s(clock)
+        with pytest.raises(DeviceTimeout, match="nor when it was asked once more"):
+            laser.check_alive() if verb == "check_alive" else laser.status
+        gap_s = laser._line._timing.gap_s
+        assert now_s(clock) - began_s <= HANG_S + gap_s
+        assert len(silences) == 1
+        laser.watch(None)
+        with pytest.raises(DeviceTimeout, match="did not send a whole line"):
+            laser.check_alive()
+        assert len(silences) == 1
+
+
+@each_dialect
+@pytest.mark.parametrize("fault", [Fault.LOST, Fault.TRUNCATED, Fault.CORRUPTED, Fault.SPLIT, Fault.MERGED, Fault.LATE])
+def test_an_answer_that_gets_lost_or_comes_late_is_no_silence(make: Make, fault: Fault) -> None:
+    with watched(make) as (server, _, laser, silences):
+        for skip in range(4):
+            server.faults = FaultScript(*[None] * skip, fault, late_s=0.22)  # a late one comes 0.02 to 0.22 s late
+            for _ in range(3):
+                laser.check_alive()
+            assert laser.status.emission
+        assert silences == []
+
+
+@each_dialect
+def test_a_host_that_was_held_up_reads_what_has_come_before_it_judges(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with watched(make) as (_, clock, laser, silences):
+        hold_up(laser._line.port, clock, monkeypatch)
+        began_s = now_s(clock)
+        laser.check_alive()
+        assert now_s(clock) - began_s >= HELD_UP_S
+        assert silences == []
+        monkeypatch.undo()
+
+
+@each_make
+def test_a_command_that_sets_something_may_take_its_time(make: Make) -> None:
+    with watched(make) as (server, _, laser, silences):
+        laser._line._timing = type(laser._line._timing)(gap_s=0.1)  # the times of real life
+        server.faults = FaultScript(*[Fault.LATE] * 2, late_s=0.8)
+        laser._line.tell(
+            {"cobolt": "p 0", "ibeam": "laser on", "obis": "SYST:CDRH ON"}[make.config.model_fields["kind"].default]
+        )
+        assert silences == []
+
+
+def test_an_emulated_laser_has_longer_and_the_config_says_how_long_a_real_one_has() -> None:
+    assert (OBIS.config.model_fields["silence"].default, MLD.config.model_fields["silence"].default) == (0.15, 0.2)
+    with wire(OBIS.model()) as (_, surroundings), OBIS.open(surroundings) as laser:
+        assert laser.silence_s == EMULATED_SILENCE_S  # type: ignore[attr-defined]
+    here = Surroundings(SystemClock(), None, 0)
+    with SerialServer(ObisModel()) as real, OBIS.open(here, port=real.path, silence="300 ms") as laser:
+        assert laser.silence_s == 0.3  # type: ignore[attr-defined]

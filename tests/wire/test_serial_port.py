@@ -26,7 +26,7 @@ from drivers.transports.serial_port import SerialPort
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import PATIENCE_S, Silent
-from tests.wire.serial_wire import SerialWire
+from tests.wire.serial_wire import HELD_UP_S, SerialWire, hold_up
 
 
 class Echo(Silent):
@@ -77,6 +77,18 @@ def test_a_reply_that_does_not_come_is_a_timeout_at_the_deadline(virtual: Serial
     with pytest.raises(DeviceTimeout, match=r"0\.2 s"):
         virtual.read_line(b"\n", 0.2)
     assert now_s(clock) == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("deadline_s", [0.02, 0.2])
+def test_what_came_while_the_host_was_held_up_is_no_timeout(
+    deadline_s: float, virtual: SerialPort, clock: VirtualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hold_up(virtual, clock, monkeypatch)
+    virtual.write(b"ab\n")
+    assert virtual.read_line(b"\r\n", deadline_s) == b"[ab]"
+    assert now_s(clock) >= HELD_UP_S
+    with pytest.raises(DeviceTimeout):
+        virtual.read_line(b"\r\n", deadline_s)
 
 
 def test_what_came_before_a_timeout_is_kept_until_the_input_is_reset(virtual: SerialPort) -> None:

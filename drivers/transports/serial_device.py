@@ -1,0 +1,38 @@
+"""The base of all devices on a serial line: raw commands without a reply, and a port that may get lost."""
+
+from typing import Protocol
+
+from drivers.interfaces.device import OPEN_STATES, Device
+from drivers.transports.serial_port import SerialPort
+
+
+class SerialLine(Protocol):
+    """The dialogue of one kind of device."""
+
+    @property
+    def port(self) -> SerialPort:
+        """The port that it uses."""
+
+    def send(self, command: str) -> None:
+        """Send a command as the device expects it, and wait for no reply. One that comes is not taken for another's."""
+
+
+class SerialDevice(Device):
+    """A device that communicates through `self._line`."""
+
+    _line: SerialLine
+
+    def send(self, command: str) -> None:
+        """Send a raw command and wait for no reply; one that comes all the same is dropped. For commands that the
+        device does not answer, for which `ask` would wait in vain.
+
+        Nothing is checked: such a command can make light or raise the gate. Raises `DeviceError` if the port is lost or
+        takes nothing.
+        """
+        self._require("send", *OPEN_STATES)
+        self._line.send(command)
+
+    @property
+    def port_lost(self) -> bool:
+        """Whether the port is gone, found out without sending anything. May be called from any thread."""
+        return self._line.port.lost
