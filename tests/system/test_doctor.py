@@ -27,7 +27,8 @@ Examine = Callable[..., dict[str, Finding]]
 
 @pytest.fixture
 def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
-    """The findings about a rig by name; `alter` changes the world's devices before they are opened."""
+    """The findings about a rig by name; `alter` changes the world's devices before they are opened. None takes a key of
+    a section away."""
 
     def found(alter: Callable[[EmulatedWorld], None] = lambda world: None, **sections: Any) -> dict[str, Finding]:
         made = EmulatedWorld.__init__
@@ -40,7 +41,8 @@ def examine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Examine:
         content = emulated()
         content["scan"] |= {"columns": 40, "exposures": 10, "frame_rate": "12.5 kHz"}
         for section, changes in sections.items():
-            content[section] |= changes
+            changed = content[section] | changes
+            content[section] = {key: value for key, value in changed.items() if value is not None}
         return {one.name: one for one in api.doctor(write_rig(tmp_path / "rig", content), out=tmp_path)}
 
     return found
@@ -82,6 +84,31 @@ def test_a_laser_that_tells_less_is_not_said_to_be_safe(
     assert found.ok
     assert all(word in found.text for word in words), found
     assert "interlock closed" not in found.text
+
+
+CARD = {"kind": "nidaq", "frame": None, "buffer": "2 s"}
+BOARD = {"kind": "etherdream", "frame": None, "buffer": "500 ms", "max_point_rate": "3.5 kHz"}
+"""Buffers that a machine with much else to do keeps full."""
+BOX = {"kind": "pulsestreamer", "hold": "external", "silence": "4 s"}
+
+
+@pytest.mark.parametrize(
+    ("scanner", "sync", "words"),
+    [
+        (CARD, {"kind": "teensy"}, ("PCIe-6363, serial 0x", "Teensy")),
+        (BOARD, BOX, ("Ether Dream, firmware v0", "Pulse Streamer 8/2")),
+    ],
+)
+def test_each_scanner_and_sync_source_is_named_and_its_markers_and_its_trigger_are_tried(
+    scanner: dict[str, Any], sync: dict[str, Any], words: tuple[str, str], examine: Examine
+) -> None:
+    found = examine(world={"scanner": scanner["kind"], "sync": sync["kind"]}, scanner=scanner, sync=sync)
+    assert all(one.ok for one in found.values()), found
+    assert [word in found[slot].text for slot, word in zip(("scanner", "sync"), words, strict=True)] == [True, True], (
+        found
+    )
+    assert "2 scan" in found["markers"].text
+    assert "starts the sync source's program" in found["trigger"].text
 
 
 def test_a_laser_that_could_not_be_armed_and_markers_that_do_not_come(

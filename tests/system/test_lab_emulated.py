@@ -17,6 +17,9 @@ from sim_backend.wire.emulated_world import KEPT_S, EmulatedWorld
 from tests.wire.scan_rig import light, mirror
 
 TRUE_EXTINCTION_PER_M = 0.087
+SLOW_HELIOS = {"frame": 0.5, "max_point_rate": 8e3}
+SLOW_CARD = {"buffer": 2.0}
+SLOW_BOARD = {"buffer": 0.5, "max_point_rate": 3.5e3}
 
 
 @pytest.fixture
@@ -43,9 +46,9 @@ def scan_slowly(tmp_path, monkeypatch):
     """A scan slower than the bundled rig's, so that a host with much else to do starts the scanner within the burst."""
     monkeypatch.setattr(prepare, "HOST_LEAD_S", 0.8)
 
-    def scan(name, **changes):
+    def scan(name, scanner=SLOW_HELIOS, **changes):
         usual = configure(name)
-        scanner = usual.scanner.model_copy(update={"frame": 0.5, "max_point_rate": 8e3})
+        scanner = usual.scanner.model_copy(update=scanner)
         slow = usual.model_copy(update={"scan": usual.scan.model_copy(update=changes), "scanner": scanner})
         api.scan(slow, out=tmp_path / "run")
         return json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -65,6 +68,18 @@ def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(scan_slowly,
     # What is known of the light is forgotten by frames, not by time: a slow machine may estimate for long after them.
     assert light(world, ended_s - 60 * KEPT_S, ended_s)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("photons")]
+
+
+@pytest.mark.parametrize(
+    ("name", "scanner"), [("lab-nidaq-emulated", SLOW_CARD), ("lab-etherdream-emulated", SLOW_BOARD)]
+)
+def test_a_small_scan_with_cards_and_boxes_that_labs_have_ends_in_a_depth_map(scan_slowly, tmp_path, name, scanner):
+    summary = scan_slowly(name, scanner, columns=30, frame_rate=Fraction(6250))
+    assert summary["verdict"] == "complete"
+    assert summary["frames"]["lost"] == 0
+    # A column is 15 px wide; a point of so slow a board is 3 px.
+    assert summary["truth"]["stripe_error_px"]["median_abs"] < 1.5
+    assert np.isfinite(np.load(tmp_path / "run" / "depth" / "000000.npy")).any()
 
 
 def test_a_scan_with_a_spad_without_markers_ends_in_a_depth_map(scan_slowly):
