@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,6 +22,7 @@ from rig.devices.calibration_use import (
     recorded_identity,
     refusals,
     same_rig,
+    try_note,
 )
 from rig.devices.doctor import examine
 from rig.devices.open import open_rig
@@ -177,6 +179,21 @@ def test_a_check_that_failed_since_then_speaks_against_a_calibration_until_one_p
         api.plan_scan(rig)
     note_check(file, model, "check", passed=True)
     api.plan_scan(rig)
+
+
+def test_a_check_that_cannot_be_noted_is_said_so_and_speaks_against_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    calibrated(tmp_path)
+    file = tmp_path / "made.yaml"
+    model = load_rig_model(file)
+    monkeypatch.setattr("rig.devices.calibration_use.replace_file", Mock(side_effect=OSError(30, "Read-only file")))
+    assert not try_note(file, model, "check", passed=False, reasons=("moved-rig",))
+    assert "made.yaml cannot be noted on: Read-only file" in caplog.text
+    assert refusals(model, file, None) == ()
+    monkeypatch.undo()
+    assert try_note(file, model, "check", passed=False, reasons=("moved-rig",))
+    assert [each.code for each in refusals(model, file, None)] == ["failed-check"]
 
 
 def test_notes_are_on_one_calibration_and_go_with_what_is_made_from_it(tmp_path: Path) -> None:
