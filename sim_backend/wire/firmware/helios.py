@@ -251,7 +251,7 @@ class _Frame:
 
     @property
     def duration_s(self) -> float:
-        """How long its points last, without a seam."""
+        """Time that its points take, without a seam."""
         return len(self.x) * self.period_s
 
 
