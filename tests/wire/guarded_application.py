@@ -23,7 +23,8 @@ SWEEP = (Pulse(0, None), Pulse(0, 0.001), Pulse(OUT_GATE, SWEEP_S - 0.003), Puls
 
 
 def main(laser_port: str, sync_port: str, mode: str = "beat") -> None:
-    laser_config, sync_config = ObisConfig(port=laser_port, max_power="50 mW"), PrawnDoConfig(port=sync_port)
+    laser_config = ObisConfig.model_validate({"port": laser_port, "max_power": "50 mW", "silence": "1.5 s"})
+    sync_config = PrawnDoConfig(port=sync_port)
     with Guard(laser=laser_config, sync=sync_config) as guard:
         laser, sync = guard.laser, guard.sync
         sync.program(SWEEP, 10_000)

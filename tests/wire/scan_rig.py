@@ -187,10 +187,20 @@ class ScanBench:
         return float("inf") if power_w else max(changed_s - since_s, 0.0)
 
 
+PATIENT = "1.5 s"
+"""Silence of an emulated device that the guard lets pass where nothing is measured."""
+
+
 @contextmanager
 def scan_bench(
-    applications: Applications, laser: str, silence: str = "1.5 s", scanner: str = "helios", sync: str = "prawndo"
+    applications: Applications,
+    laser: str,
+    silence: str = PATIENT,
+    scanner: str = "helios",
+    sync: str = "prawndo",
+    laser_silence: str | None = PATIENT,
 ) -> Iterator[ScanBench]:
+    """silence, laser_silence: of SPAD and laser, that the guard lets pass. None: that of the laser's kind."""
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
         geometry = folder / "calibration.yaml"
@@ -213,7 +223,9 @@ def scan_bench(
             elif laser == "obis":
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
-            (folder / "rig.yaml").write_text(yaml.safe_dump(_config(laser, ports, silence, scanner, sync)))
+            (folder / "rig.yaml").write_text(
+                yaml.safe_dump(_config(laser, ports, silence, scanner, sync, laser_silence))
+            )
             bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
             try:
                 yield bench
@@ -235,7 +247,9 @@ def _end(bench: ScanBench) -> None:
     bench.applications.exit_code(bench.number, 5.0)
 
 
-def _config(laser: str, ports: dict[str, str], silence: str, scanner: str, sync: str) -> dict[str, Any]:
+def _config(
+    laser: str, ports: dict[str, str], silence: str, scanner: str, sync: str, laser_silence: str | None
+) -> dict[str, Any]:
     """The config of a rig with real ports; its world is outside of it."""
     content = emulated(**ports)
     del content["world"]
@@ -252,6 +266,8 @@ def _config(laser: str, ports: dict[str, str], silence: str, scanner: str, sync:
         card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
         content["scanner"] |= card
     content["laser"]["kind"], content["sync"]["kind"] = laser, sync
+    if laser_silence is not None:
+        content["laser"]["silence"] = laser_silence
     if laser == "ttl":
         content["laser"] = {"kind": laser, "power": POWER, "max_power": "50 mW"}  # a real one has no port
     content["scan"] |= {"columns": COLUMNS, "exposures": EXPOSURES, "frame_rate": "12.5 kHz", "power": POWER}

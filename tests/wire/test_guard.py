@@ -146,7 +146,8 @@ def test_what_cannot_be_opened_is_told_device_by_device(port: str, told: str, ri
 def test_a_laser_is_off_before_it_is_opened_once_the_guard_is_gone(channel: int | None) -> None:
     model = ObisModel(cdrh_delay_s=0.0, channel=channel, autostart=True, prompt=True)
     with SerialServer(model) as server:
-        config = ObisConfig.model_validate({"port": server.path, "max_power": "50 mW", "channel": channel})
+        given = {"port": server.path, "max_power": "50 mW", "channel": channel, "silence": "1.5 s"}
+        config = ObisConfig.model_validate(given)
         with Guard(laser=config) as guard:
             guard.laser.arm(POWER_W)
             assert model.emitting
@@ -249,6 +250,19 @@ def test_no_first_frame_at_all_ends_the_light(rig: GuardedRig) -> None:
                 verb()
         guard.sync.abort()
         guard.laser.pause()
+
+
+def test_a_laser_whose_firmware_hangs_ends_the_light(rig: GuardedRig) -> None:
+    with guard_of(rig, GuardLimits(first_frame_s=PATIENCE_S, help_itself_s=PATIENCE_S)) as guard:
+        guard.laser.arm(POWER_W)
+        guard.sync.program(SWEEP, 1000)
+        guard.sync.run()
+        rig.laser.hang()
+        eventually(lambda: guard.failure is not None and rig.sync.model._levels[-1] == 0)  # type: ignore[attr-defined]
+        assert "answered nothing to" in str(guard.failure)
+        assert rig.emits
+        rig.laser.resume()
+        eventually(lambda: not rig.emits)  # it is told until it hears
 
 
 def test_closing_leaves_all_dark_and_may_be_done_twice(rig: GuardedRig) -> None:

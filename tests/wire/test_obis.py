@@ -467,7 +467,7 @@ def test_a_flipped_bit_in_a_temperature_ends_nothing() -> None:
 def test_the_guard_ends_the_light_of_a_laser_that_gets_too_warm() -> None:
     model = ObisModel(cdrh_delay_s=0.0)
     with SerialServer(model, baud=1_000_000) as server:  # the guard is a process of its own
-        config = ObisConfig.model_validate({"port": server.path, "max_power": "80 mW"})
+        config = ObisConfig.model_validate({"port": server.path, "max_power": "80 mW", "silence": "1.5 s"})
         with Guard(laser=config) as guard:
             guard.laser.arm(0.05)
             model.base_c = 55.0

@@ -16,7 +16,7 @@ import tempfile
 import time
 from contextlib import closing
 
-from tests.wire.scan_rig import Applications, ScanFailedError, scan_bench
+from tests.wire.scan_rig import PATIENT, Applications, ScanFailedError, scan_bench
 
 MAPS = 500
 """Maps of one scan: a quarter of a minute where the emulated devices keep up."""
@@ -39,6 +39,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--burners", type=int, default=2 * (os.cpu_count() or 1))
+    parser.add_argument("--laser-silence", default=PATIENT, help="that the guard lets pass; a real OBIS has 150 ms")
     options = parser.parse_args()
     tripped, others, scans, lit_s = 0, 0, 0, 0.0
     with closing(Applications()) as scanning, tempfile.NamedTemporaryFile(dir=".", prefix="guard-load-") as scratch:
@@ -47,7 +48,7 @@ def main() -> int:
         ends_at = time.monotonic() + options.seconds
         try:
             while time.monotonic() < ends_at:
-                seconds, code, said = _scan(scanning)
+                seconds, code, said = _scan(scanning, options.laser_silence)
                 scans, lit_s = scans + 1, lit_s + seconds
                 by_guard = any(words in said for words in TRIPPED)
                 tripped += by_guard
@@ -66,9 +67,9 @@ def main() -> int:
     return int(tripped > 0)
 
 
-def _scan(scanning: Applications) -> tuple[float, int | None, str]:
+def _scan(scanning: Applications, laser_silence: str) -> tuple[float, int | None, str]:
     """Seconds from first light to end, exit code and words of one scan."""
-    with scan_bench(scanning, "obis") as bench:
+    with scan_bench(scanning, "obis", laser_silence=laser_silence) as bench:
         bench.start(maps=MAPS, record=True, labours=True)
         try:
             bench.await_light()
