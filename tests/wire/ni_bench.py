@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from drivers.clock import Clock, VirtualClock, now_s
 from drivers.interfaces import MARKER_SCAN, BeamScanner, ScanWaveform
 from drivers.registry import Surroundings
+from drivers.scanners import nidaq, nidaq_card
 from drivers.scanners.nidaq import Nidaq, NidaqConfig, create
 from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from sim_backend.wire.firmware.nidaq import NidaqModel
 from sim_backend.wire.serve.grpc import GrpcServer
+from tests.wire.lasers import PATIENCE_S
 from tests.wire.scanners import GALVO, cosine
 
 
@@ -53,10 +56,11 @@ class NiBench:
 
 @contextmanager
 def ni_bench(clock: Clock | None = None, **options: Any) -> Iterator[NiBench]:
-    """options: those of the model."""
+    """options: those of the model. Calls take the host's time, so they get long deadlines: it may be busy."""
     clock = clock or VirtualClock(1_000_000_000)
     model = NidaqModel(**options)
-    with GrpcServer(model, clock=clock) as server:
+    patient = patch.object(nidaq_card, "CALL_S", PATIENCE_S), patch.object(nidaq, "_PATIENT", PATIENCE_S)
+    with patient[0], patient[1], GrpcServer(model, clock=clock) as server:
         yield NiBench(model, server, clock)
 
 

@@ -339,12 +339,11 @@ def test_a_lost_server_is_said_by_every_verb_and_close_returns(
         assert bench.levels() == [0, 0, 0]
 
 
-def test_a_server_that_hangs_ends_every_verb_in_time(bench: NiBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nidaq_card, "CALL_S", 0.3)
-    monkeypatch.setattr(nidaq_card, "_LATE_S", 0.05)
+def test_a_server_that_hangs_ends_every_verb_in_time(bench: NiBench) -> None:
     device = bench.open()
     device.load(marked(device), 10_000)
     device.start()
+    device._card._limit_s, device._card._late_s = 0.12, 0.05
     bench.server.hang()
     finish(device)
     assert "no answer of the gRPC server" in str(device.status.fault)

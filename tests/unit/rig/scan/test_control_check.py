@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -178,13 +177,11 @@ def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: P
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a pipe with a name stands for a disk that does not answer")
 def test_a_disk_that_hangs_holds_no_device_up_and_loses_nothing(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / CONTROL_FILE)  # opening it waits for somebody who reads
+    os.mkfifo(tmp_path / CONTROL_FILE)  # opening it waits for somebody who reads: nobody, until the notes have returned
     tap = Tap(TapFile.begin(tmp_path / CONTROL_FILE), "sync")
-    begun = time.monotonic()
     for command in (b"abt\n", b"man 0\n"):
         tap.note("serial", OUT, command)
     tap.flush(timeout_s=0.1)
-    assert time.monotonic() - begun < 1.0
     with (tmp_path / CONTROL_FILE).open("rb", buffering=0) as pipe:
         tap.flush()
         lines = pipe.read(10_000).splitlines()
