@@ -200,7 +200,8 @@ def scan_bench(
     sync: str = "prawndo",
     laser_silence: str | None = PATIENT,
 ) -> Iterator[ScanBench]:
-    """silence, laser_silence: of SPAD and laser, that the guard lets pass. None: that of the laser's kind."""
+    """silence, laser_silence: of SPAD and laser, that the guard lets pass. A Pulse Streamer gets that of the laser.
+    None: that of the device's kind."""
     with tempfile.TemporaryDirectory() as name, UmockdevBus(SystemClock()) as bus:
         folder = Path(name)
         geometry = folder / "calibration.yaml"
@@ -266,6 +267,8 @@ def _config(
         card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
         content["scanner"] |= card
     content["laser"]["kind"], content["sync"]["kind"] = laser, sync
+    if sync == "pulsestreamer":
+        content["sync"] |= {"hold": "external"} | ({"silence": laser_silence} if laser_silence else {})
     if laser_silence is not None:
         content["laser"]["silence"] = laser_silence
     if laser == "ttl":

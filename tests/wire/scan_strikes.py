@@ -153,11 +153,8 @@ SCAN_STRIKES = {
         own_end=True,
         scanner="etherdream",
         light_s=ETHERDREAM_S,
-        emission_s=EMISSION_S + 1.5,
     ),
-    "etherdream starved": ScanStrike(
-        _starve_scanner, own_end=True, scanner="etherdream", light_s=ETHERDREAM_S, emission_s=EMISSION_S + ETHERDREAM_S
-    ),
+    "etherdream starved": ScanStrike(_starve_scanner, own_end=True, scanner="etherdream", light_s=ETHERDREAM_S),
     "etherdream stopped": ScanStrike(_stop_scanner, own_end=True, scanner="etherdream"),
     "etherdream restarted": ScanStrike(_restart_scanner, own_end=True, scanner="etherdream"),
     "gate unplugged": ScanStrike(_unplug_gate, own_end=True),
@@ -175,6 +172,13 @@ SCAN_STRIKES = {
     "killed, teensy": ScanStrike(_signal(signal.SIGKILL), sync="teensy"),
     "teensy hangs": ScanStrike(_hang_gate, sync="teensy", light_s=NEVER_S),
     "teensy unplugged": ScanStrike(_unplug_gate, own_end=True, sync="teensy"),
+    # The box goes on by itself: light ends with the laser's emission. Questions have no answer, or are refused.
+    "pulse streamer's cable pulled": ScanStrike(
+        lambda bench: bench.world.gate_wire.hang(), own_end=True, sync="pulsestreamer", light_s=NEVER_S, lasting=True
+    ),
+    "pulse streamer refuses": ScanStrike(
+        lambda bench: bench.world.gate_wire.unplug(), own_end=True, sync="pulsestreamer", light_s=NEVER_S, lasting=True
+    ),
     # An NI card's scan marker stays as it was.
     "killed, ni card": ScanStrike(_signal(signal.SIGKILL), scanner="nidaq"),
     "ni card's server gone": ScanStrike(lambda bench: bench.world.scanner_plug.unplug(), own_end=True, scanner="nidaq"),
