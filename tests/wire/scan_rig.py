@@ -68,7 +68,8 @@ def light(world: EmulatedWorld, from_s: float, until_s: float) -> list[tuple[flo
             world.scanner.advance(until_s)
             high = world.scanner.history.level(BLUE, at) > 0
         gate += [(float(at[index]), 2, bool(high[index])) for index in np.flatnonzero(np.diff(high, prepend=~high[:1]))]
-    for at_s, which, level in [*sorted(gate + emission), (until_s, 0, False)]:
+    changes = sorted(gate + emission, key=lambda change: change[0])  # of several before `from_s` the last one holds
+    for at_s, which, level in [*changes, (until_s, 0, False)]:
         was_lit = all(levels)
         levels[which] = level
         if all(levels) and not was_lit:

@@ -6,11 +6,15 @@ driver notices a lost box is tried in `test_pulsestreamer`; how soon the light e
 
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from drivers.errors import DeviceError
+from drivers.interfaces import OUT_GATE
 from rig import api
 from sim_backend.wire.emulated_world import EmulatedWorld
 from tests.system.small_rig import emulated, write_rig
@@ -36,6 +40,14 @@ def strike(world: EmulatedWorld, name: str) -> None:
             world.gate_wire.hang()
         case "scanner unplugged":
             world.scanner_plug.unplug()
+
+
+def test_emission_that_ended_before_is_no_light_and_one_that_goes_on_is() -> None:
+    gate = SimpleNamespace(advance=lambda until_s: None, changes=lambda from_s, until_s: [(from_s, OUT_GATE)])
+    world: Any = SimpleNamespace(gate_wire=SimpleNamespace(lock=nullcontext()), sync=gate, _emission_lock=nullcontext())
+    world._emission = [(0.0, 0.0), (1.0, 0.02), (2.0, 0.0)]
+    assert light(world, 3.0, 4.0) == []
+    assert light(world, 1.5, 4.0) == [(1.5, 2.0)]
 
 
 @pytest.mark.parametrize("name", BLOWS)
