@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rig.api.scan import scan
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene, load_scene, procedural_scene
@@ -117,3 +118,13 @@ def test_any_number_of_exposures_columns_and_pixels(
     assert ours["missing"] <= MISSING
     if exposures > 1:
         assert ours["mean_abs"] <= GENIE_RATIO * genie_figures(point, exposures, 1)["mean_abs"]
+
+
+def test_in_dense_fog_the_halo_is_not_taken_for_a_wide_line() -> None:
+    """A line of 0.8 px was learned as one of 1.85 px here, while wider lines were judged by more pixels."""
+    result = scan("simulated", scene="street-dense-fog", estimator="likelihood", exposures=3, seed=31)
+    assert result.last is not None
+    assert result.truth is not None
+    assert result.last.learned.line_sigma_px < 1.5
+    sure = result.last.stripe.confidence >= 0.9
+    assert (np.abs(result.last.stripe.x_px - result.truth.x_px)[sure] <= 1.0).mean() > 0.95

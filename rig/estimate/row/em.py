@@ -24,7 +24,7 @@ import numpy as np
 from rig.count.volume import CountVolume
 from rig.estimate.row.inputs import Lines, RowBuffers, RowState, Sweep, judge_line, row_buffers, state_of, sweep_of
 from rig.estimate.row.likelihood import mode_of
-from rig.estimate.row.model import AMPLITUDES, BINS, RowModel, fit_haze, stripe_scale
+from rig.estimate.row.model import AMPLITUDES, BINS, RowModel, fit_haze, line_profile, line_reach, stripe_scale
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Float32, Float64, Int32
@@ -104,9 +104,12 @@ def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable
     return Lines(volume.counts[columns, rows].astype(np.int32), rows, columns, volume.n_frames[columns], x_px, trust)
 
 
-def expect(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> Expectation:
-    """The expectation step of `model` over some lines."""
+def expect(
+    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers, *, reach_px: int | None = None
+) -> Expectation:
+    """The expectation step of `model` over some lines. reach_px: of `line_profile`."""
     sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
+    state = state._replace(psi=line_profile(model.line_sigma_px, reach_px))
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
     parts: dict[int, Expectation] = {}
@@ -204,11 +207,16 @@ def learn_again(
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:
-    """The model with another line width, one step away, if that makes the counts clearly likelier; else as it is."""
+    """The model with another line width, one step away, if that makes the counts clearly likelier; else as it is.
+
+    All widths are judged by the same pixels around a stripe. With the pixels farther out that a wider line has, the
+    halo of dense fog would be taken for a wide line.
+    """
+    reach_px = line_reach(model.line_sigma_px)
     tried = [
         replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
     ]
-    evidence = [expect(lines, geometry, m, workers).evidence for m in tried]
+    evidence = [expect(lines, geometry, m, workers, reach_px=reach_px).evidence for m in tried]
     best = int(np.argmax(evidence))
     return tried[best] if evidence[best] > evidence[1] + WIDTH_EVIDENCE else model
 

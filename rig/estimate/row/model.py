@@ -108,19 +108,21 @@ def stripe_scale(path_m: Float64, extinction_per_m: float) -> Float64:
     return np.asarray(np.exp(np.clip(log_scale - log_scale[middle], -30.0, 30.0)))
 
 
-def line_profile(sigma_px: float) -> Float32:
-    """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre, (T + 1,); T = 2 to 6 covers 2.5 sigma."""
-    return pixel_shares(sigma_px, np.arange(_reach(sigma_px) + 1, dtype=np.float64))
+def line_profile(sigma_px: float, reach_px: int | None = None) -> Float32:
+    """Share of a Gaussian line in the pixels 0, 1, ... T px from its centre, (T + 1,). T: reach_px, or `line_reach`."""
+    reach_px = line_reach(sigma_px) if reach_px is None else reach_px
+    return pixel_shares(sigma_px, np.arange(reach_px + 1, dtype=np.float64))
 
 
 def fine_profiles(sigma_px: float) -> Float32:
     """Share of the line in pixels -R..R, R = T + 1, for LABELS centres LABEL_PX apart around 0, (LABELS, 2R + 1)."""
-    reach = _reach(sigma_px) + 1
+    reach = line_reach(sigma_px) + 1
     centres = (np.arange(LABELS) - LABELS // 2) * LABEL_PX
     return pixel_shares(sigma_px, np.arange(-reach, reach + 1) - centres[:, None])
 
 
-def _reach(sigma_px: float) -> int:
+def line_reach(sigma_px: float) -> int:
+    """Pixels to either side of a line's centre over which its light is counted: 2 to 6, to cover 2.5 sigma."""
     return int(min(max(2, math.ceil(2.5 * sigma_px)), 6))
 
 
