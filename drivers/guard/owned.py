@@ -68,12 +68,12 @@ class Owned:
         config: dict[str, Any],
         ports: dict[str, str],
         tap: dict[str, Any] | None,
-        on_silence: Callable[[DeviceError], object],
+        watch: tuple[Callable[[DeviceError], object], Callable[[], object]],
     ) -> None:
-        """tap: fields of the `TapFile` that records its port; None: nothing is recorded. on_silence: called, on any
-        thread, if an armed laser answers nothing any more."""
+        """tap: fields of the `TapFile` that records its port; None: nothing is recorded. watch: arguments of
+        `LineLaser.watch` while the device is an armed laser."""
         self.slot = slot
-        self._on_silence = on_silence
+        self._watch = watch
         self.device: Any = None
         self.armed = False
         """Whether this is a laser that is to be disarmed if the application cannot go on."""
@@ -127,7 +127,7 @@ class Owned:
         if isinstance(device, LineLaser):
             self.armed = (self.armed or verb == "arm") and verb != "disarm"
             self.emits = (self.emits or verb == "arm") and verb not in ("pause", "disarm")
-            device.watch(self._on_silence if self.armed else None)
+            device.watch(*(self._watch if self.armed else (None,)))
         match verb:
             case "status":
                 return asdict(device.status)

@@ -68,10 +68,14 @@ class LineLaser(Device):
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
-    def watch(self, on_silence: Callable[[DeviceError], object] | None) -> None:
+    def watch(
+        self, on_silence: Callable[[DeviceError], object] | None, settle: Callable[[], object] = lambda: None
+    ) -> None:
         """Have `on_silence` called, on any thread, as soon as the laser answers a question later than it ever should
         and says nothing when asked once more. None: no longer. The guard does this while the laser is armed. Does
         nothing for a laser that cannot be asked.
+
+        settle: called before the laser is judged; returns once nothing on this host holds its answer up.
         """
 
     def check_alive(self) -> None:

@@ -348,6 +348,20 @@ def test_a_host_that_was_held_up_reads_what_has_come_before_it_judges(
         monkeypatch.undo()
 
 
+@each_dialect
+def test_a_busy_host_is_waited_for_before_a_laser_is_judged(make: Make) -> None:
+    with watched(make) as (server, clock, laser, silences):
+
+        def settle() -> None:
+            clock.sleep(10.0)
+            server.resume()
+
+        laser.watch(silences.append, settle)
+        server.hang()
+        laser.check_alive()
+        assert silences == []
+
+
 @each_make
 def test_a_command_that_sets_something_may_take_its_time(make: Make) -> None:
     with watched(make) as (server, _, laser, silences):

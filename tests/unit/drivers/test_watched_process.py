@@ -1,5 +1,6 @@
 """Is another process at work? Asked of real processes."""
 
+import os
 import subprocess
 import sys
 import time
@@ -54,6 +55,22 @@ def test_a_process_that_computes_is_at_work_and_one_asleep_is_not() -> None:
         assert busy_looks(WatchedProcess(pid)) == 20
     with running(ASLEEP) as (pid, _):
         eventually(lambda: busy_looks(WatchedProcess(pid)) <= 2)  # it may only be about to fall asleep
+
+
+def test_each_processor_is_visited_and_the_thread_may_run_on_all_of_them_afterwards(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    allowed, asked = os.sched_getaffinity(0), []
+
+    class Library:
+        def sched_setaffinity(self, thread: int, size: int, mask: bytes) -> None:
+            libc.sched_setaffinity(thread, size, mask)
+            asked.append(os.sched_getaffinity(0))
+
+    libc = watched_process._LIBC
+    monkeypatch.setattr(watched_process, "_LIBC", Library())
+    watched_process.visit_processors()
+    assert asked == [*({processor} for processor in allowed), allowed]
 
 
 def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at_work_does(
