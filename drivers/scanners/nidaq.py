@@ -510,7 +510,7 @@ class Nidaq(DacScanner):
             raise
 
     def _make_safe(self) -> None:
-        self._card.hurry()
+        self._card.limit_waits()
         super()._make_safe()
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:

@@ -112,7 +112,7 @@ class NiCard:
         finally:
             self._limit_s = self._call_s
 
-    def hurry(self) -> None:
+    def limit_waits(self) -> None:
         """Wait no longer for the server, from now on, than a close may take."""
         self._call_s, self._late_s = _CLOSE_S, _CLOSE_LATE_S
         self._limit_s = min(self._limit_s, _CLOSE_S)
@@ -220,7 +220,7 @@ class NiCard:
         status = getattr(getattr(error, "rpc_code", None), "name", None)
         if status is None:
             return DeviceNotFound(f"{self.name}: {text}; install NI-DAQmx on this computer, or use a gRPC server")
-        if status == "UNAVAILABLE":
+        if status in ("UNAVAILABLE", "CANCELLED"):
             return DeviceDisconnected(f"{self.name}: gRPC server lost, while the card keeps its levels; check both")
         if status == "DEADLINE_EXCEEDED":
             return DeviceTimeout(f"{self.name}: no answer of the gRPC server in time; check the network")
