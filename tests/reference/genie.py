@@ -1,7 +1,8 @@
 """The genie: the row likelihood that is told haze, ambient, line width, geometry and the scene's albedo histogram.
 
-Hypothesis j: haze before j, half of it at j, none behind, and a Gaussian stripe centred on j whose amplitude follows
-from the plane's depth at j, the extinction and an albedo drawn from the histogram. With counts n of K exposures
+Hypothesis j: haze before j, half of it at j, behind it the pedestal if there is one (`Light.pedestal`), and a Gaussian
+stripe centred on j whose amplitude follows from the plane's depth at j, the extinction and an albedo drawn from the
+histogram. With counts n of K exposures
 
     log L(j, albedo) = sum_x n_x log(expm1 flux_x) - K flux_x
 
@@ -54,7 +55,7 @@ class Genie:
         def work(first: int, end: int) -> None:
             estimate_columns(
                 counts, exposures, wanted, point.optics, light.ambient, point.stripe_scale * strengths, np.log(weights),
-                shares, lit, self.mean_reach, table, first, end, x_est,
+                shares, lit, light.pedestal, self.mean_reach, table, first, end, x_est,
             )  # fmt: skip
 
         over_columns(g.columns, work)
@@ -102,9 +103,23 @@ def log_expm1(flux, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def estimate_columns(  # type: ignore[no-untyped-def]
-    counts, exposures, rows, optics, ambient, strengths, log_weights, shares, lit, mean_reach, table, first, end, x_est
+    counts,
+    exposures,
+    rows,
+    optics,
+    ambient,
+    strengths,
+    log_weights,
+    shares,
+    lit,
+    pedestal,
+    mean_reach,
+    table,
+    first,
+    end,
+    x_est,
 ):
-    """Fill x_est (H, columns) for columns first..end on the given rows."""
+    """Fill x_est (H, columns) for columns first..end on the given rows. pedestal: share of the haze."""
     u, v, planes, scanner = optics.u, optics.v, optics.planes, optics.scanner
     extinction, haze_scale = optics.extinction, optics.haze
     inv_near, inv_far = 1 / DEPTH_RANGE_M[0], 1 / DEPTH_RANGE_M[1]
@@ -114,6 +129,7 @@ def estimate_columns(  # type: ignore[no-untyped-def]
     number = strengths.size
     dark = log_expm1(ambient, table)
     inverse, haze, near_sum, amplitude = np.empty(width), np.empty(width), np.empty(width + 1), np.empty(width)
+    behind, decay_px = np.empty(width), optics.halo_px[1]
     coarse, posterior, values = np.empty(width * labels), np.empty(width * labels), np.empty(number)
     for c in range(first, end):
         n0, n1, n2, d = planes[c]
@@ -144,6 +160,13 @@ def estimate_columns(  # type: ignore[no-untyped-def]
                 z = 1.0 / inverse[j]
                 path = kernels.path_length(u[y, x], v[y, x], z, scanner)
                 amplitude[j] = math.exp(-extinction * path) / (z * z)
+                behind[j] = 0.0
+                for i in range(j + reach + 1, high if pedestal > 0.0 else 0):
+                    x = i if forward else width - 1 - i
+                    flux = pedestal * haze[j] * math.exp(-(i - j) / decay_px)
+                    behind[j] -= exposures * flux
+                    if counts[c, y, x] > 0:
+                        behind[j] += counts[c, y, x] * (log_expm1(ambient + flux, table) - dark)
             for sweep in range(2):
                 for j in range(start, stop):
                     for m in range(labels):
@@ -153,7 +176,7 @@ def estimate_columns(  # type: ignore[no-untyped-def]
                             continue
                         stride = COARSE_STEP if sweep == 0 else 1
                         top = -np.inf
-                        base = near_sum[max(low, j - reach)]
+                        base = near_sum[max(low, j - reach)] + behind[j]
                         for r in range(stride // 2, number, stride):
                             s = strengths[r] * amplitude[j]
                             total = base
@@ -163,6 +186,7 @@ def estimate_columns(  # type: ignore[no-untyped-def]
                                     continue
                                 x = i if forward else width - 1 - i
                                 flux = haze[i] * lit[m, k] + s * shares[m, k]
+                                flux += (1 - lit[m, k]) * pedestal * haze[j] * math.exp(-max(i - j, 0) / decay_px)
                                 total -= exposures * flux
                                 if counts[c, y, x] > 0:
                                     total += counts[c, y, x] * (log_expm1(ambient + flux, table) - dark)

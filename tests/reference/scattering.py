@@ -47,10 +47,13 @@ def halo_and_pedestal(
     x_true: NDArray[np.float64],
     x_end: NDArray[np.float64],
     stripe: NDArray[np.float64],
+    *,
+    share: float | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Photons per exposure (H, columns): the halo's total, and the pedestal per pixel just behind the sheet's end.
 
-    Third: the optical depth of that end, 0 where it is outside the picture.
+    Third: the optical depth of that end, 0 where it is outside the picture. share: of the haze that the pedestal has at
+    every optical depth, without a halo; None for forward-peaked fog.
     """
     halo, pedestal, depth = np.zeros_like(stripe), np.zeros_like(stripe), np.zeros_like(stripe)
     places = np.arange(geometry.width)
@@ -62,8 +65,11 @@ def halo_and_pedestal(
         inverse_z = (n0 * u + n1 * v + n2) / d
         inside &= inverse_z > 0
         tau = np.where(inside, extinction_per_m / np.where(inside, inverse_z, 1.0), 0.0)
-        depth[y], halo[y] = tau, stripe[y] * halo_total(tau)
+        depth[y] = tau
+        if share is None:
+            halo[y] = stripe[y] * halo_total(tau)
+        behind = pedestal_share(tau) if share is None else np.full_like(tau, share)
         for c in np.flatnonzero(inside):
             before = kernels.haze_at(u[c], v[c], inverse_z[c], geometry.scanner_m, extinction_per_m)
-            pedestal[y, c] = haze_scale * before * pedestal_share(tau[c])
+            pedestal[y, c] = haze_scale * before * behind[c]
     return halo, pedestal, depth

@@ -41,6 +41,8 @@ class Light:
     optical_depth: sets the extinction so that light reaches the scene's median depth after so many mean free paths.
     multiple_scattering: halo and pedestal of forward-peaked fog. `ambient` holds the dark counts of a pixel too: they
     are multiplied by a log-normal number of width `uneven`, and for `hot_share` of the pixels by one of `HOT_TIMES`.
+    pedestal: light behind the stripe as a share of the haze before it, where scattering is single. lit_by_day: whether
+    ambient light is proportional to the albedo of what a pixel sees, in place of even.
     """
 
     stripe: float = 0.7
@@ -52,6 +54,8 @@ class Light:
     multiple_scattering: bool = False
     uneven: float = 0.0
     hot_share: float = 0.0
+    pedestal: float = 0.0
+    lit_by_day: bool = False
 
 
 REPORT = Light()
@@ -67,6 +71,7 @@ POINTS = {
     "halo-less": replace(FORWARD, multiple_scattering=False),
     "hot": HOT,
     "uneven": replace(HOT, uneven=0.5),
+    "dirty": replace(HOT, uneven=0.5, pedestal=0.2, lit_by_day=True),
 }
 HOT_TIMES = (10.0, 100.0)
 """Rates of hot pixels over the median one, evenly in the logarithm. Of a real sensor 1 % of the pixels are above 10
@@ -98,11 +103,14 @@ class WorkingPoint:
         self.haze_scale = light.haze / mean_free_haze(g, light.extinction_per_m) if light.haze > 0 else 0.0
         self.x_second, self.second = self._second()
         self.halo, self.pedestal, self.optical_depth = (np.zeros_like(self.stripe) for _ in range(3))
-        if light.multiple_scattering:
+        if light.multiple_scattering or light.pedestal:
             self.halo, self.pedestal, self.optical_depth = scattering.halo_and_pedestal(
-                g, light.extinction_per_m, self.haze_scale, self.x_true, self.x_end, self.stripe
-            )
+                g, light.extinction_per_m, self.haze_scale, self.x_true, self.x_end, self.stripe,
+                share=None if light.multiple_scattering else light.pedestal,
+            )  # fmt: skip
         self.ambient = dark_map(light, scene.shape)
+        if light.lit_by_day:
+            self.ambient *= scene.albedo / np.mean(scene.albedo)
 
     def _ends(
         self, depth_m: NDArray[np.float64], strength: NDArray[np.float64]

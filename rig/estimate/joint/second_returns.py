@@ -439,23 +439,25 @@ def behind_specks(
 
     room: as `second_returns` has left it for these stripes.
     """
-    assert stripes.x2_px is not None, "second returns have been looked for"
-    assert stripes.confidence2 is not None, "second returns have been looked for"
-    if not (stripes.confidence2 >= SPECK_SURE).any():
-        return stripes
-    distance, distance2 = (np.float32(x_px - grid.x_far) for x_px in (stripes.x_px, stripes.x2_px))
-    speck, (_, ones, expected, *_) = np.empty(distance.shape, np.bool_), room.seconds
-    table = (
-        stripes.x_px, stripes.confidence, stripes.x_sd_px, stripes.signal, stripes.haze, stripes.x2_px,
-        stripes.confidence2,
-    )  # fmt: skip
+    x2_px, confidence2 = stripes.x2_px, stripes.confidence2
+    assert x2_px is not None, "second returns have been looked for"
+    assert confidence2 is not None, "second returns have been looked for"
+    far, n_frames = grid.x_far.astype(np.float32), np.ascontiguousarray(n_frames, np.int32)
+    distance, distance2 = stripes.x_px - far, x2_px - far
+    speck, (_, ones, expected, *_) = np.zeros(distance.shape, np.bool_), room.seconds
+    table = (stripes.x_px, stripes.confidence, stripes.x_sd_px, stripes.signal, stripes.haze, x2_px, confidence2)
 
     def find(first: int, last: int) -> None:
-        find_specks(
-            distance, distance2, stripes.confidence2, stripes.signal, n_frames, ones, expected, first, last, speck
-        )
+        find_specks(distance, distance2, confidence2, stripes.signal, n_frames, ones, expected, first, last, speck)
 
+    def both(first: int, last: int) -> None:
+        exchange(distance, distance2, speck, first, last, table)
+
+    if not (confidence2 >= SPECK_SURE).any():
+        # No row, so that nothing is left to compile for the first speck of a scan.
+        find(0, 0)
+        both(0, 0)
+        return stripes
     workers.over(len(speck), find)
-    if speck.any():
-        workers.over(len(speck), lambda first, last: exchange(distance, distance2, speck, first, last, table))
+    workers.over(len(speck), both)
     return stripes
