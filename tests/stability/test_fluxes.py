@@ -25,7 +25,15 @@ from rig.estimate.row.likelihood import (
     row_posterior,
     row_scores,
 )
-from rig.estimate.row.model import EXTINCTION_MAX_PER_M, RowModel, fine_profiles, fit_haze, line_profile, stripe_scale
+from rig.estimate.row.model import (
+    EXTINCTION_MAX_PER_M,
+    RowModel,
+    fine_profiles,
+    fit_haze,
+    line_profile,
+    line_reach,
+    stripe_scale,
+)
 from rig.estimate.search.rows import EXPOSURE_PARTS, count_fluxes
 from tests.stability.inventory import EXAMPLES, covers
 
@@ -208,7 +216,7 @@ def test_stripe_scales_are_finite_and_fall_with_distance(near, ratio, extinction
     assert np.all(np.diff(scale) <= 0)
 
 
-@covers(line_profile, fine_profiles)
+@covers(line_profile, line_reach, fine_profiles)
 @pytest.mark.parametrize("sigma_px", [0.05, 0.25, 0.6, 2.4])
 def test_line_profiles_are_exact_and_whole(sigma_px, worst) -> None:
     def share(distance, sigma):
@@ -216,7 +224,8 @@ def test_line_profiles_are_exact_and_whole(sigma_px, worst) -> None:
         return (mpmath.erf((distance + 0.5) * unit) - mpmath.erf((distance - 0.5) * unit)) / 2
 
     profile = line_profile(sigma_px)
-    profiles = [(profile, np.arange(len(profile)))]
+    assert len(profile) == line_reach(sigma_px) + 1 in range(3, 8)
+    profiles = [(values, np.arange(len(values))) for values in (profile, line_profile(sigma_px, 4))]
     for i, fine in enumerate(fine_profiles(sigma_px)):
         profiles.append((fine, np.arange(len(fine)) - len(fine) // 2 - (i - LABELS // 2) * LABEL_PX))
     for values, away in profiles:
