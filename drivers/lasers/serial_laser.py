@@ -150,9 +150,9 @@ class SerialLaser(SerialDevice, LineLaser):
         self._left.may_shine = True
         super().send(command)
 
-    def watch(self, on_silence: OnSilence | None, settle: Callable[[], object] = lambda: None) -> None:
+    def watch(self, on_silence: OnSilence | None, late_s: Callable[[], float] = lambda: 0.0) -> None:
         """See `LineLaser`."""
-        self._line.watch(on_silence, self.silence_s, settle)
+        self._line.watch(on_silence, self.silence_s, late_s)
 
     def check_alive(self) -> None:
         """See `LineLaser`."""

@@ -113,16 +113,16 @@ class Dialogue:
         self._quiet_since_s = now_s(clock)
         self._silence_s = timing.reply_s
         self._on_silence: OnSilence | None = None
-        self._settle: Callable[[], object] = lambda: None
+        self._late_s: Callable[[], float] = lambda: 0.0
         self._silent = False
         self._unread = False
         """Whether a reply may come that nobody waits for."""
 
-    def watch(self, on_silence: OnSilence | None, silence_s: float, settle: Callable[[], object]) -> None:
+    def watch(self, on_silence: OnSilence | None, silence_s: float, late_s: Callable[[], float]) -> None:
         """Watch the dialogue from now on: a question unanswered for `silence_s` shows that the device may hang. If it
-        says nothing within `AGAIN_S` after another question and `settle`, `on_silence` is called, and what was asked
-        raises `DeviceTimeout` at once. on_silence: None to watch no longer. settle: as in `LineLaser.watch`."""
-        self._on_silence, self._silence_s, self._settle = on_silence, silence_s, settle
+        says nothing within `AGAIN_S + late_s()` after another question, `on_silence` is called, and what was asked
+        raises `DeviceTimeout` at once. on_silence: None to watch no longer. late_s: as in `LineLaser.watch`."""
+        self._on_silence, self._silence_s, self._late_s = on_silence, silence_s, late_s
 
     def check_alive(self) -> None:
         """Ask the question that is answered fastest. Raises `DeviceTimeout` if the device is silent."""
@@ -250,8 +250,7 @@ class Dialogue:
         be the late answer, so both are dropped before the next command."""
         self.port.write(self._framing.encode(self._framing.quickest))
         try:
-            self._settle()
-            self.port.read_line(b"\n", AGAIN_S)
+            self.port.read_line(b"\n", AGAIN_S + self._late_s())
         except DeviceTimeout:
             return False
         return True

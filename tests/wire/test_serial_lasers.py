@@ -351,15 +351,15 @@ def test_a_host_that_was_held_up_reads_what_has_come_before_it_judges(
 @each_dialect
 def test_a_busy_host_is_waited_for_before_a_laser_is_judged(make: Make) -> None:
     with watched(make) as (server, clock, laser, silences):
-
-        def settle() -> None:
-            clock.sleep(10.0)
-            server.resume()
-
-        laser.watch(silences.append, settle)
-        server.hang()
+        laser.watch(silences.append, lambda: 1.0)
+        server.faults = FaultScript(Fault.STALL, stall_s=1.0)
         laser.check_alive()
-        assert silences == []
+        server.hang()
+        began_s = now_s(clock)
+        with pytest.raises(DeviceTimeout):
+            laser.check_alive()
+        assert now_s(clock) - began_s == pytest.approx(1.0 + HANG_S, abs=0.12)
+        assert len(silences) == 1
 
 
 @each_make

@@ -6,11 +6,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from unittest.mock import mock_open
 
 import pytest
 
 from drivers.guard import watch as watched_process
-from drivers.guard.watch import WatchedProcess
+from drivers.guard.watch import HELD_UP_S, WatchedProcess, held_up_s
 from tests.wire.lasers import eventually
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc is Linux's")
@@ -57,22 +58,6 @@ def test_a_process_that_computes_is_at_work_and_one_asleep_is_not() -> None:
         eventually(lambda: busy_looks(WatchedProcess(pid)) <= 2)  # it may only be about to fall asleep
 
 
-def test_each_processor_is_visited_and_the_thread_may_run_on_all_of_them_afterwards(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    allowed, asked = os.sched_getaffinity(0), []
-
-    class Library:
-        def sched_setaffinity(self, thread: int, size: int, mask: bytes) -> None:
-            libc.sched_setaffinity(thread, size, mask)
-            asked.append(os.sched_getaffinity(0))
-
-    libc = watched_process._LIBC
-    monkeypatch.setattr(watched_process, "_LIBC", Library())
-    watched_process.visit_processors()
-    assert asked == [*({processor} for processor in allowed), allowed]
-
-
 def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at_work_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -82,3 +67,14 @@ def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at
         monkeypatch.setattr(watched_process, "_AT_WORK", ())
         assert busy_looks(WatchedProcess(pid)) > 10  # on a loaded machine it may get no turn between two looks
         eventually(lambda: busy_looks(WatchedProcess(pid, thread)) <= 4)
+
+
+@pytest.mark.parametrize(("per_processor", "late_s"), [(1, 0.0), (3, 0.0), (4, HELD_UP_S)])
+def test_an_overloaded_host_may_hold_up_bytes(
+    per_processor: int, late_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running = per_processor * (os.cpu_count() or 1)
+    monkeypatch.setattr("builtins.open", mock_open(read_data=b"0.09 0.33 0.71 %d/312 4711\n" % running))
+    assert held_up_s() == late_s
+    monkeypatch.undo()
+    assert held_up_s() in (0.0, HELD_UP_S)
