@@ -284,8 +284,8 @@ class SpadArray(Device):
         number, which may raise to end the run. Calls after the end return False. If another thread calls `stop`
         meanwhile, the call returns False early.
         """
-        if not (self._run_opened and self._state is DeviceState.CONFIGURED):
-            self._require("fill", DeviceState.RUNNING, first="start")
+        ended = (DeviceState.CONFIGURED,) if self._run_opened else ()
+        self._require("fill", DeviceState.RUNNING, *ended, first="start")
         if self._state is not DeviceState.RUNNING:
             return False
         more = self._do_fill(ring, timeout_s)

@@ -249,3 +249,16 @@ def test_a_stop_that_comes_while_a_block_is_filled_and_a_close_end_the_run() -> 
         spad.answers = [partial(end, spad)]
         assert not spad.fill(BlockRing(1, 1024), 0.1)
         assert spad.stopped == 1
+
+
+def test_a_stop_by_another_thread_just_when_the_state_is_checked_ends_the_run() -> None:
+    class StoppedMeanwhile(ScriptedSpad):
+        def _require(self, verb: str, *allowed: DeviceState, first: str = "") -> None:
+            if verb == "fill":
+                self.stop()
+            super()._require(verb, *allowed, first=first)
+
+    spad = StoppedMeanwhile()
+    spad.configure(BURST)
+    spad.start(100)
+    assert not spad.fill(BlockRing(1, 1024), 0.1)
