@@ -26,11 +26,11 @@ from drivers.errors import (
 from drivers.interfaces import HOLD_S, OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
 from drivers.registry import Surroundings, lookup
 from drivers.sync.teensy import KIND, MOST, BoardLimits, Teensy, TeensyConfig, encode
-from drivers.sync.teensy_line import USB_IDS
+from drivers.sync.teensy_line import TRIES, USB_IDS
 from sim_backend.wire.firmware.teensy import TeensyModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import Fault, FaultScript
-from tests.wire.lasers import Babble, Silent, eventually
+from tests.wire.lasers import PATIENCE_S, Babble, Silent, eventually
 from tests.wire.syncs import USB_BAUD, TeensyBoard, teensy
 
 TEENSY = BoardLimits("Teensy")
@@ -335,19 +335,29 @@ def test_the_driver_feeds_the_watchdog_until_it_is_deleted_or_the_board_is_deaf(
 
 def test_the_gate_goes_low_at_once_beside_a_question_that_is_not_answered(board: Any) -> None:
     server, surroundings = board
-    with Teensy(TeensyConfig(port="emulated:sync"), surroundings, reply_s=6.0) as device:
+    config = TeensyConfig.model_validate({"port": "emulated:sync", "watchdog": "60 s"})
+    with Teensy(config, surroundings, reply_s=TRIES * PATIENCE_S) as device:
         device.program(LIT, 1)
         device.run()
-        receive = server.model.receive
-        server.model.receive = lambda data, now_s: b"" if b"status" in data else receive(data, now_s)
+        receive, asked = server.model.receive, []
+
+        def leave_unanswered(data: bytes, now_s: float) -> Any:
+            if b"status" not in data:
+                return receive(data, now_s)
+            asked.append(data)
+            return b""
+
+        server.model.receive = leave_unanswered
         asking = threading.Thread(target=lambda: device.status)
         asking.start()
-        time.sleep(0.1)
+        eventually(lambda: asked)
         lowering = threading.Thread(target=device.gate_low)
         lowering.start()
         eventually(lambda: server.model._gate_low)
         assert asking.is_alive()
-        server.model.receive = receive  # the question comes again
+        with server.lock:
+            server.model.receive = receive
+            server._reply(receive(asked[0], server._now_s()))
         for thread in (asking, lowering):
             thread.join()
         assert server.model.why == "none"

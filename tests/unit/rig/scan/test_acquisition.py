@@ -179,7 +179,8 @@ def test_a_gate_that_does_not_go_low_has_the_laser_paused_on_that_thread():
 
 
 @pytest.mark.parametrize("unplugged", [False, True])
-def test_maps_that_are_whole_when_the_scanner_stops_early_are_still_given(unplugged):
+def test_maps_that_are_whole_when_the_scanner_stops_early_are_still_given(unplugged, monkeypatch):
+    monkeypatch.setattr("rig.scan.acquisition.TELL_S", PATIENCE_S)  # the scanner is asked once map 0 was taken
     rig, log = rig_of(5)
     at_work = threading.Event()
 

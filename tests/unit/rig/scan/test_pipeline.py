@@ -141,6 +141,7 @@ def test_a_source_that_can_wait_waits_for_a_slow_caller_longer_than_the_time_out
     for found in acquired.run():
         if not maps:
             wait_until(lambda: acquired.stages.source_wait_s > 0.1)
+            wait_until(lambda: acquired.stages.map_queue_high_water == pipeline.MAPS_AHEAD)
         maps.append(found)
     received, lost = accounted(maps)
     assert (len(maps), lost) == (MAPS, 0)
