@@ -49,9 +49,10 @@ class PrawnDoTiming:
     reply_s: float = 0.5
     """Deadline for a reply."""
     hasty_s: float = 0.06
-    """Deadline for a reply on the way to low outputs, where asking again is better than waiting."""
-    lower_s: float = 0.5
-    """Deadline for outputs to be confirmed low."""
+    """Deadline for a reply on the way to low outputs, where asking again is better than waiting. It doubles each time
+    that none comes: the kernel of an overloaded host hands bytes over up to 0.94 s late (docs/results/guard.md)."""
+    lower_s: float = 1.0
+    """Time after which no further attempt to confirm low outputs begins. The last one may take about as long again."""
     load_s: float = 5.0
     """Deadline for the answer to a program: 360 kB at USB full speed, with much to spare."""
 
@@ -190,22 +191,24 @@ class PrawnDoLine:
 
     def _lower_surely(self) -> None:
         ends_at = now_s(self.clock) + self._timing.lower_s
+        hasty_s = self._timing.hasty_s
         while True:
             try:
-                if self._try_to_lower():
+                if self._try_to_lower(hasty_s):
                     return
                 trouble: DeviceError = DeviceFault(f"{self._name}: its outputs do not go low")
-            except (DeviceTimeout, ProtocolError) as error:
+            except DeviceTimeout as error:
+                trouble, hasty_s = error, 2 * hasty_s
+            except ProtocolError as error:
                 trouble = error
             if now_s(self.clock) > ends_at:
                 raise trouble
             self.port.write(_LOWER)
 
-    def _try_to_lower(self) -> bool:
+    def _try_to_lower(self, hasty_s: float) -> bool:
         """Try once; returns whether the outputs read back low. The round trip of `abt` gives the board's second core
-        the time to end the program.
+        the time to end the program. hasty_s: deadline for each reply.
         """
-        hasty_s = self._timing.hasty_s
         self.transact("abt", hasty_s, urgent=True)
         if self.run_status(hasty_s, urgent=True)[0] not in IDLE:
             return False

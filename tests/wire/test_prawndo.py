@@ -471,3 +471,13 @@ def test_a_port_of_another_usb_device_is_refused_before_a_byte_is_sent() -> None
             wire.open()
         assert not heard
         assert "\n" not in str(refused.value)
+
+
+def test_outputs_are_confirmed_low_though_every_answer_reaches_an_overloaded_host_late() -> None:
+    with board() as wire, wire.open() as device:
+        device.program([Pulse(OUT_GATE, 30.0)], 1)
+        device.run()
+        queue = wire.server._queue
+        wire.server._queue = lambda at, data: queue(at + 0.4, data)  # type: ignore[method-assign]
+        device.abort()
+        assert wire.pins == 0
