@@ -68,7 +68,7 @@ class Owned:
         config: dict[str, Any],
         ports: dict[str, str],
         tap: dict[str, Any] | None,
-        watch: tuple[Callable[[DeviceError], object], Callable[[], float]],
+        watch: tuple[Callable[[DeviceError], object], Callable[[], bool]],
     ) -> None:
         """tap: fields of the `TapFile` that records its port; None: nothing is recorded. watch: arguments of
         `LineLaser.watch` while the device is an armed laser."""

@@ -28,7 +28,7 @@ from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, InterlockOpen
 from drivers.guard.channel import Channel, Heartbeat, Message, error_message
 from drivers.guard.owned import Owned, make_safe
-from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess, held_up_s
+from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess, host_overloaded
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
 from drivers.transports.endpoints import Endpoint
@@ -44,7 +44,7 @@ POLL_S = 1.0
 ALIVE_S = 0.1
 """Time from the last question to an armed laser to the next one, which only shows that its firmware still runs. With
 the kind's `silence`, `drivers.transports.dialogue.AGAIN_S` and the time to lower the gate, the light of a laser that
-hangs is off within 500 ms. An overloaded host waits longer (`held_up_s`)."""
+hangs is off within 500 ms. An overloaded host waits longer (`host_overloaded`)."""
 END_CHECK_S = 0.2
 """Time between checks whether the gate's program has ended, while an application at work is late with its frames."""
 GATE_FIRST_S = 0.1
@@ -127,7 +127,7 @@ class GuardProcess:
         self._watch.limits = GuardLimits(**message["limits"])
         for slot, config in message["open"].items():
             try:
-                owned = Owned(slot, config, message["ports"], message["tap"], (self._trip, held_up_s))
+                owned = Owned(slot, config, message["ports"], message["tap"], (self._trip, host_overloaded))
             except Exception as error:  # a config that is unusable here is reported to the application
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue

@@ -223,13 +223,10 @@ def _work_ns(task: str) -> int:
 
 BUSY_THREADS = 3
 """A host is overloaded while more threads than this run or wait for each of its processors."""
-HELD_UP_S = 1.2
-"""Longest time for which an overloaded host may hold up received bytes. With 7 to 18 threads for each processor the
-kernel itself handed some over 0.94 s late (one in 5000 later than 0.29 s), while threads of this process went on."""
 
 
-def held_up_s() -> float:
-    """Time to wait longer for bytes since this host is overloaded now; 0 on any other."""
+def host_overloaded() -> bool:
+    """Whether this host is overloaded now. Many threads that wake at once look like that for some milliseconds."""
     with open("/proc/loadavg", "rb") as file:
         running = int(file.read().split()[3].partition(b"/")[0])
-    return HELD_UP_S if running > BUSY_THREADS * (os.cpu_count() or 1) else 0.0
+    return running > BUSY_THREADS * (os.cpu_count() or 1)

@@ -69,13 +69,13 @@ class LineLaser(Device):
         return self._do_status()
 
     def watch(
-        self, on_silence: Callable[[DeviceError], object] | None, late_s: Callable[[], float] = lambda: 0.0
+        self, on_silence: Callable[[DeviceError], object] | None, overloaded: Callable[[], bool] = lambda: False
     ) -> None:
         """Have `on_silence` called, on any thread, as soon as the laser answers a question later than it ever should
         and says nothing when asked once more. None: no longer. The guard does this while the laser is armed. Does
         nothing for a laser that cannot be asked.
 
-        late_s: called before the laser is judged; returns for how much longer this host may hold up its answer.
+        overloaded: whether this host has so much to do now that it may hold up an answer.
         """
 
     def check_alive(self) -> None:

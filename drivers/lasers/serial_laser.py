@@ -52,7 +52,7 @@ class SerialLaserConfig(KindConfig):
 
 
 EMULATED_SILENCE_S = 1.5
-"""The same for an emulated laser, which shares this computer's processors and may itself be late."""
+"""That time for an emulated laser, which shares this computer's processors and may itself be late."""
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ _ANY = re.compile(".*")
 
 
 class _Left:
-    """What a laser leaves behind if it is deleted without a close. This does not refer to the laser itself."""
+    """Things left to do if a laser is deleted without a close. This does not refer to the laser itself."""
 
     def __init__(self) -> None:
         self.may_shine = False
@@ -150,9 +150,9 @@ class SerialLaser(SerialDevice, LineLaser):
         self._left.may_shine = True
         super().send(command)
 
-    def watch(self, on_silence: OnSilence | None, late_s: Callable[[], float] = lambda: 0.0) -> None:
+    def watch(self, on_silence: OnSilence | None, overloaded: Callable[[], bool] = lambda: False) -> None:
         """See `LineLaser`."""
-        self._line.watch(on_silence, self.silence_s, late_s)
+        self._line.watch(on_silence, self.silence_s, overloaded)
 
     def check_alive(self) -> None:
         """See `LineLaser`."""

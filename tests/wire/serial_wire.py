@@ -132,7 +132,7 @@ class EmulatedPort:
             self._end = -1
 
 
-HELD_UP_S = 5.0
+STANDSTILL_S = 5.0
 
 
 def hold_up(port: SerialPort, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +142,7 @@ def hold_up(port: SerialPort, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> 
 
     def late(size: int) -> bytes:
         if size and not emulated.in_waiting:
-            clock.sleep(HELD_UP_S)
+            clock.sleep(STANDSTILL_S)
             return b""
         data: bytes = read(size)
         return data

@@ -24,7 +24,7 @@ from drivers.lasers.ibeam import IbeamConfig
 from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import EMULATED_SILENCE_S, SerialLaser, SerialLaserConfig
 from drivers.registry import Surroundings, kinds, lookup
-from drivers.transports.dialogue import FairLock
+from drivers.transports.dialogue import HELD_UP_S, FairLock
 from drivers.transports.serial_port import AGAIN_S
 from rig.config.files import load_config
 from rig.devices import open as session
@@ -37,7 +37,7 @@ from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import USUAL, Babble, Silent, bring_up, eventually, open_cobolt, open_ibeam, open_obis, wire
-from tests.wire.serial_wire import HELD_UP_S, hold_up
+from tests.wire.serial_wire import STANDSTILL_S, hold_up
 
 
 @dataclass(frozen=True)
@@ -343,23 +343,32 @@ def test_a_host_that_was_held_up_reads_what_has_come_before_it_judges(
         hold_up(laser._line.port, clock, monkeypatch)
         began_s = now_s(clock)
         laser.check_alive()
-        assert now_s(clock) - began_s >= HELD_UP_S
+        assert now_s(clock) - began_s >= STANDSTILL_S
         assert silences == []
         monkeypatch.undo()
 
 
 @each_dialect
-def test_a_busy_host_is_waited_for_before_a_laser_is_judged(make: Make) -> None:
+@pytest.mark.parametrize(("busy_looks", "longer_s"), [(0, 0.0), (3, 0.12), (1000, HELD_UP_S)])
+def test_an_overloaded_host_is_waited_for_while_it_is_overloaded(make: Make, busy_looks: int, longer_s: float) -> None:
     with watched(make) as (server, clock, laser, silences):
-        laser.watch(silences.append, lambda: 1.0)
-        server.faults = FaultScript(Fault.STALL, stall_s=1.0)
-        laser.check_alive()
+        looks = iter([True] * busy_looks)
+        laser.watch(silences.append, lambda: next(looks, False))
         server.hang()
         began_s = now_s(clock)
         with pytest.raises(DeviceTimeout):
             laser.check_alive()
-        assert now_s(clock) - began_s == pytest.approx(1.0 + HANG_S, abs=0.12)
+        assert now_s(clock) - began_s == pytest.approx(longer_s + HANG_S, abs=0.12)
         assert len(silences) == 1
+
+
+@each_dialect
+def test_an_answer_that_an_overloaded_host_holds_up_is_no_silence(make: Make) -> None:
+    with watched(make) as (server, _, laser, silences):
+        laser.watch(silences.append, lambda: True)
+        server.faults = FaultScript(Fault.STALL, stall_s=1.0)
+        laser.check_alive()
+        assert silences == []
 
 
 @each_make

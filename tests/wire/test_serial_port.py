@@ -26,7 +26,7 @@ from drivers.transports.serial_port import SerialPort
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import PATIENCE_S, Silent
-from tests.wire.serial_wire import HELD_UP_S, SerialWire, hold_up
+from tests.wire.serial_wire import STANDSTILL_S, SerialWire, hold_up
 
 
 class Echo(Silent):
@@ -86,7 +86,7 @@ def test_what_came_while_the_host_was_held_up_is_no_timeout(
     hold_up(virtual, clock, monkeypatch)
     virtual.write(b"ab\n")
     assert virtual.read_line(b"\r\n", deadline_s) == b"[ab]"
-    assert now_s(clock) >= HELD_UP_S
+    assert now_s(clock) >= STANDSTILL_S
     with pytest.raises(DeviceTimeout):
         virtual.read_line(b"\r\n", deadline_s)
 

@@ -50,7 +50,7 @@ class Laser(PlainLaser):
         self.on_silence: Callable[[DeviceError], object] | None = None
 
     def watch(
-        self, on_silence: Callable[[DeviceError], object] | None, late_s: Callable[[], float] = lambda: 0.0
+        self, on_silence: Callable[[DeviceError], object] | None, overloaded: Callable[[], bool] = lambda: False
     ) -> None:
         self.on_silence = on_silence
 
@@ -73,7 +73,7 @@ CONFIGS = {"laser": {"kind": "ttl", "power": "20 mW", "max_power": "50 mW"}, "sy
 
 
 def owned(slot: str, device: Any, process: GuardProcess, does: list[str]) -> Owned:
-    made = Owned(slot, CONFIGS[slot], {}, None, (process._trip, lambda: 0.0))
+    made = Owned(slot, CONFIGS[slot], {}, None, (process._trip, lambda: False))
     made.device = device
     made.lane, made.urgent = Lane(does, slot), Lane(does, f"{slot}, urgent")  # type: ignore[assignment]
     process._owned[slot] = made
