@@ -59,8 +59,8 @@ def ni_bench(clock: Clock | None = None, **options: Any) -> Iterator[NiBench]:
     """options: those of the model. Calls take the host's time, so they get long deadlines: it may be busy."""
     clock = clock or VirtualClock(1_000_000_000)
     model = NidaqModel(**options)
-    patient = patch.object(nidaq_card, "CALL_S", PATIENCE_S), patch.object(nidaq, "_PATIENT", PATIENCE_S)
-    with patient[0], patient[1], GrpcServer(model, clock=clock) as server:
+    patient = patch.multiple(nidaq_card, CALL_S=PATIENCE_S, _LATE_S=PATIENCE_S, _CLOSE_S=PATIENCE_S)
+    with patient, patch.object(nidaq, "_PATIENT", PATIENCE_S), GrpcServer(model, clock=clock) as server:
         yield NiBench(model, server, clock)
 
 

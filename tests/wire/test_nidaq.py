@@ -356,7 +356,10 @@ def test_a_server_that_hangs_ends_every_verb_in_time(bench: NiBench) -> None:
     device = bench.open()
     device.load(marked(device), 10_000)
     device.start()
-    device._card._limit_s, device._card._late_s = 0.12, 0.05
+    device._card._call_s = device._card._limit_s = 0.12  # whether or not its thread has begun to be patient
+    device._card._late_s = 0.05
+    bench.model.calls = []
+    eventually(lambda: len(bench.model.calls) > 1)  # the call under way was still a patient one
     bench.server.hang()
     finish(device)
     assert "no answer of the gRPC server" in str(device.status.fault)

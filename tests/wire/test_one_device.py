@@ -35,7 +35,7 @@ from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire import syncs
 from tests.wire.etherdream import wired
 from tests.wire.lasercube import LaserCubeModel
-from tests.wire.lasers import bring_up, wire
+from tests.wire.lasers import PATIENCE_S, bring_up, wire
 from tests.wire.ni_bench import ni_bench
 from tests.wire.spb_device import model
 from tests.wire.syncs import board, pulse_box
@@ -82,6 +82,9 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
             spad512s: Surroundings(at_laser.clock, None, 0, {"spad": spad.endpoint}),
             spb_usb: Surroundings(clock, None, 0),
         }
+        # Calls to a box take the host's time, and it may be busy.
+        monkeypatch.setattr(pulsestreamer.PulseStreamer.__init__, "__defaults__", (PATIENCE_S,))
+        monkeypatch.setitem(pulsestreamer.PulseStreamer.open.__func__.__kwdefaults__, "silence_s", 4.0)
         for module, surroundings in places.items():
             monkeypatch.setattr(module, "alone", lambda surroundings=surroundings: surroundings)
         monkeypatch.setattr("drivers.transports.usb_device._libusb", lambda: bus)
