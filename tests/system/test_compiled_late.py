@@ -23,17 +23,18 @@ from tests.system.small_rig import config, write_rig
 MAPS, LESSON_FRAMES = 5, 1600
 """Maps of 800 lit frames, and how many there are from one lesson to the next."""
 EMULATED: dict[str, Any] = {
-    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis"},
+    "world": {"kind": "emulated", "geometry": "./rig.yaml", "scene": "street", "laser": "obis", "scanner": "nidaq"},
     "spad": {"kind": "spb-usb", "port": "emulated:spad", "reads": "plain", "heartbeat": "10 s"},
     "scanner": {
-        "kind": "helios",
+        "kind": "nidaq",
         "port": "emulated:scanner",
         "max_velocity": "4000 /s",
         "max_acceleration": "4e6 /s2",
         "rms_duty": 1.0,
-        "frame": "500 ms",
+        "buffer": "2 s",
+        "max_point_rate": "10 kHz",
     },
-    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW"},
+    "laser": {"kind": "obis", "port": "emulated:laser", "max_power": "50 mW", "silence": "1.5 s"},
     "sync": {"kind": "prawndo", "port": "emulated:gate"},
 }
 SCAN = {"columns": 40, "exposures": 12, "frame_rate": "12.5 kHz"}
