@@ -221,7 +221,7 @@ def _work_ns(task: str) -> int:
     return int(ran) + int(waited)
 
 
-BUSY_THREADS = 3
+BUSY_THREADS = 5
 """A host is overloaded while more threads than this run or wait for each of its processors."""
 
 

@@ -69,7 +69,7 @@ def test_what_a_thread_that_wakes_by_itself_did_does_not_count_but_that_it_is_at
         eventually(lambda: busy_looks(WatchedProcess(pid, thread)) <= 4)
 
 
-@pytest.mark.parametrize(("per_processor", "overloaded"), [(1, False), (3, False), (4, True)])
+@pytest.mark.parametrize(("per_processor", "overloaded"), [(1, False), (5, False), (6, True)])
 def test_a_host_is_overloaded_while_many_threads_run_or_wait(
     per_processor: int, overloaded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
