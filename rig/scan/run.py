@@ -4,6 +4,7 @@
 verdict, and an account of each sweep for the manifest.
 """
 
+import gc
 import math
 import os
 import platform
@@ -139,7 +140,10 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove a folder that was not finished, unless a block was recorded: 'rig repair' completes the recording."""
+        """Remove a folder that was not finished, unless a block was recorded: 'rig repair' completes the recording.
+
+        Also give back the memory of what the run used.
+        """
         try:
             if self._recording is not None:
                 self._recording.close()
@@ -148,6 +152,9 @@ class Run:
                 self._folder.keep()
             elif self._folder is not None:
                 self._folder.discard()
+            # Threads and callbacks of a scan refer to one another and to its ring and maps, hundreds of MB. Python
+            # would collect them so seldom that a notebook's hundredth scan ran out of memory.
+            gc.collect()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
         """Take the next map. If an error or interrupt comes meanwhile, the map counts completely or not at all. Raises

@@ -1,9 +1,11 @@
 """The calls of docs/tutorials/notebook.md, on a rig small enough for a test."""
 
+import gc
 from pathlib import Path
 
 import pytest
 
+from drivers.ring import BlockRing
 from rig.api import effects, plan_scan, plan_text, scan
 from tests.system.small_rig import HEIGHT, WIDTH
 
@@ -37,3 +39,14 @@ def test_the_document_runs_as_far_as_names_go() -> None:
     code = NOTEBOOK.read_text().split("```python\n")[1].split("```")[0]
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
     compile(code, str(NOTEBOOK), "exec")
+
+
+def test_a_scan_gives_back_the_memory_of_its_ring(small: Path) -> None:
+    """Its threads and callbacks refer to one another, and many scans in one process ran out of memory."""
+    gc.disable()
+    try:
+        scan(small, seed=1, estimator="joint", exposures=2)
+        left = [type(each).__name__ for each in gc.get_objects() if isinstance(each, BlockRing)]
+    finally:
+        gc.enable()
+    assert left == []
