@@ -189,8 +189,8 @@ class CoboltConfig(SerialLaserConfig):
 
     kind: Literal["cobolt"] = "cobolt"
     silence: Annotated[Seconds, Field(ge=0.05, le=2)] = 0.2
-    """Longest time without an answer, as in `SerialLaserConfig`. No source says how soon a Cobolt answers a question; this
-    is twice the time that it needs between two."""
+    """Longest time without an answer, as in `SerialLaserConfig`. No source says how soon a Cobolt answers a question;
+    this is twice the time that it needs between two."""
 
 
 class CoboltLaser(SerialLaser):
