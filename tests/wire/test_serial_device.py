@@ -78,12 +78,13 @@ def test_trap_a_command_of_a_cobolt_that_has_no_reply_is_sent_and_not_asked() ->
 
 
 FORGETS = """
-import sys, time
+import signal, sys, time
 from drivers.clock import SystemClock
 from drivers.registry import Surroundings, lookup
 from drivers.transports.dialogue import LineTiming
 from drivers.lasers import {kind}
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests may run where Ctrl-C is ignored
 config = {kind}.KIND.config.model_validate({{"port": sys.argv[1], "max_power": "80 mW"}})
 laser = {kind}.create(config, Surroundings(SystemClock(), None, 0), LineTiming())
 laser.arm(0.05)
