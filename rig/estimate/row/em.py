@@ -107,9 +107,10 @@ def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable
 def expect(
     lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers, *, reach_px: int | None = None
 ) -> Expectation:
-    """The expectation step of `model` over some lines. reach_px: of `line_profile`."""
+    """The expectation step of `model` over some lines. reach_px: of `line_profile`, None for the line's own."""
     sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
-    state = state._replace(psi=line_profile(model.line_sigma_px, reach_px))
+    if reach_px is not None:
+        state = state._replace(psi=line_profile(model.line_sigma_px, reach_px))
     # Fixed pieces, added in order: the sums do not depend on the number of threads.
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
     parts: dict[int, Expectation] = {}
