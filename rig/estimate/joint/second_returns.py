@@ -442,8 +442,9 @@ def behind_specks(
     x2_px, confidence2 = stripes.x2_px, stripes.confidence2
     assert x2_px is not None, "second returns have been looked for"
     assert confidence2 is not None, "second returns have been looked for"
-    far, n_frames = grid.x_far.astype(np.float32), np.ascontiguousarray(n_frames, np.int32)
-    distance, distance2 = stripes.x_px - far, x2_px - far
+    rows = len(x2_px) if (confidence2 >= SPECK_SURE).any() else 0
+    far, n_frames = grid.x_far[:rows].astype(np.float32), np.ascontiguousarray(n_frames, np.int32)
+    distance, distance2 = stripes.x_px[:rows] - far, x2_px[:rows] - far
     speck, (_, ones, expected, *_) = np.zeros(distance.shape, np.bool_), room.seconds
     table = (stripes.x_px, stripes.confidence, stripes.x_sd_px, stripes.signal, stripes.haze, x2_px, confidence2)
 
@@ -453,11 +454,11 @@ def behind_specks(
     def both(first: int, last: int) -> None:
         exchange(distance, distance2, speck, first, last, table)
 
-    if not (confidence2 >= SPECK_SURE).any():
+    if not rows:
         # No row, so that nothing is left to compile for the first speck of a scan.
         find(0, 0)
         both(0, 0)
         return stripes
-    workers.over(len(speck), find)
-    workers.over(len(speck), both)
+    workers.over(rows, find)
+    workers.over(rows, both)
     return stripes
