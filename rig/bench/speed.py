@@ -51,6 +51,10 @@ COUNT_EXPOSURES = (1, 3, 5, 10, 15, 20, 50)
 WINDOW = 128
 """Window, in px, of the rows that are measured at one window only."""
 FEW_EXPOSURES = (1, 10)
+MAP_EXPOSURES = (1, 3, 10)
+"""Exposures at which `joint` makes a map from counts."""
+SWEEP_EXPOSURES = (3, 10)
+"""Exposures at which `joint` counts and makes maps as in a stream: three are the working point to recommend."""
 LEARN_EXPOSURES = 10
 """Exposures per column of the sweep from which each window's model is learned; it holds for any number of exposures."""
 READ_BYTES = 256 * 2**20
@@ -292,13 +296,14 @@ def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
     most, window = max(workers), WINDOWS[0]
     model = stages.learn_joint(surface, LEARN_EXPOSURES, most)
     cases = [Case("sgbm", window, None, n, None, stages.sgbm_stage(surface, n)) for n in workers]
-    for k in FEW_EXPOSURES:
+    for k in MAP_EXPOSURES:
         bits = surface.frames(k, workers[most])
         volume = count_surface(surface, bits, k, workers[most])
-        cases += [Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)) for n in workers]
-    cases += [
-        Case("joint-sweep", window, k, n, None, stages.joint_sweep_stage(surface, bits, k, n, model)) for n in workers
-    ]
+        for n in workers:
+            cases.append(Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)))
+            if k in SWEEP_EXPOSURES:
+                sweep = stages.joint_sweep_stage(surface, bits, k, n, model)
+                cases.append(Case("joint-sweep", window, k, n, None, sweep))
     return cases
 
 

@@ -101,7 +101,9 @@ def test_the_report_has_a_row_for_every_stage_window_exposures_and_threads(repor
     assert len(rows) == len(report.rows)
     for window, k, threads in itertools.product((128,), (1, 10), (1, 2)):
         assert {("count", window, k, threads), ("likelihood", window, k, threads), ("numpy", window, k, 1)} <= set(rows)
-        assert {("joint", 64, k, threads), ("joint-sweep", 64, 10, 2), ("sgbm", 64, None, threads)} <= set(rows)
+    for k, threads in itertools.product((1, 3, 10), (1, 2)):
+        assert {("joint", 64, k, threads), ("sgbm", 64, None, threads)} <= set(rows)
+        assert (("joint-sweep", 64, k, threads) in rows) == (k > 1)
     assert {row[0] for row in rows} == {
         "count", "likelihood", "likelihood-full", "likelihood-sweep", "disk", "numpy", "joint", "joint-sweep", "sgbm",
     }  # fmt: skip
@@ -127,8 +129,8 @@ def test_estimating_rows_tell_their_error_and_others_none(report, rows):
 
 
 def test_rows_of_whole_maps_tell_the_time_of_one(report, rows):
-    joint = {("joint", k, threads) for k, threads in itertools.product((1, 10), (1, 2))}
-    for stage, k, threads in {("joint-sweep", 10, 2), *joint}:
+    joint = {("joint", k, threads) for k, threads in itertools.product((1, 3, 10), (1, 2))}
+    for stage, k, threads in {("joint-sweep", 3, 2), ("joint-sweep", 10, 2), *joint}:
         row = rows[stage, 64, k, threads]
         # Each is a median over rounds of its own: their product is that of one round where all are alike, else more.
         assert 0.99 < row.ms_per_map * row.frames_per_s / (1e3 * SMALL.map_columns * k) < 10
