@@ -1,8 +1,8 @@
-"""Makes the tables of the search along a row, per column and band of rows, from a model and a geometry.
+"""Makes the tables of the search along a row: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-The search is a fast form of `rig.estimate.row.likelihood`, tested against it. This module decides how many rows share a
-table (`rows_of_band`). It also chooses the unit of likelihood, and the exposures above which counts are halved, so that
-no 16-bit sum overflows (`judge_of`). tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
+They are made per column and band of rows, from a model and a geometry. This module decides how many rows share a table
+(`rows_of_band`). It also chooses the unit of likelihood, and the exposures above which counts are halved, so that no
+16-bit sum overflows (`judge_of`). tests/unit/rig/estimate/search/test_prepare.py checks those bounds.
 """
 
 from typing import Any

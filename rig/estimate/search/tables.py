@@ -1,8 +1,8 @@
-"""Tables of the search along a row, per column and band of rows, and a thread's buffers.
+"""Tables of the search along a row: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-They hold the terms of `rig.estimate.row.likelihood` in integers, with `units` units to an octave (a factor of 2) of
-likelihood. With the probability p' that a pixel fires, p'_L left and p'_R right of the stripe, and p'_S where the
-stripe lights it,
+There is a table per column and band of rows; a thread's buffers are here too. Tables hold the terms of the likelihood
+in integers, with `units` units to an octave (a factor of 2) of likelihood. With the probability p' that a pixel fires,
+p'_L left and p'_R right of the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_L - logit p'_R                  int8: a count at a pixel left of position x
     tap  = logit p'_S - logit p'_L or R             int8: a count at a pixel around x, for SCREENS amplitudes

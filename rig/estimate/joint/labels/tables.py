@@ -1,7 +1,8 @@
-"""Tables of the label costs, per column, band of rows and variant, and the working memory.
+"""Tables of the label costs: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
-They hold the terms of `rig.estimate.row.likelihood`, relative to 'everything is before the stripe'. With the
-probability p' that a pixel fires, p'_B before and p'_E behind the stripe, and p'_S where the stripe lights it,
+There is a table per column, band of rows and variant; the working memory is here too. Tables hold the terms of the
+likelihood, relative to 'everything is before the stripe'. With the probability p' that a pixel fires, p'_B before and
+p'_E behind the stripe, and p'_S where the stripe lights it,
 
     edge = logit p'_E - logit p'_B                  int16: a count at a pixel behind the stripe
     tap  = logit p'_S - logit (p'_B or p'_E)        int16: a count at a pixel around a label, for LIGHTS amplitudes;
