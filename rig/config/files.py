@@ -31,6 +31,7 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "filter"): "--filter",
     ("estimate", "min_confidence"): "--min-confidence",
     ("estimate", "temporal_prior"): "--temporal-prior",
+    ("estimate", "learned"): "--learned",
     ("estimate", "threads"): "--threads",
 }
 """Options of the command line, by the key of the config that each sets."""

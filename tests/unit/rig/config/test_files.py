@@ -1,3 +1,4 @@
+import inspect
 import json
 import re
 import tomllib
@@ -9,6 +10,7 @@ import yaml
 from drivers.registry import SLOTS, lookup
 from rig.config.bundled import BUNDLED
 from rig.config.files import (
+    FLAGS,
     bundled_configs,
     completed_text,
     config_content,
@@ -18,6 +20,7 @@ from rig.config.files import (
     portable_content,
 )
 from rig.config.models import EstimateConfig, RigConfig, ScanConfig
+from rig.config.overrides import configure
 from rig.errors import UsageError
 
 ROOT = Path(__file__).parents[4]
@@ -150,6 +153,13 @@ def test_a_mistake_in_an_override_is_called_an_option(write):
         "option: unknown key 'scan.colum'; did you mean 'columns'?",
         "--exposures is 0, it must be at least 1; write for example '--exposures 10'",
     ]
+
+
+def test_every_option_that_replaces_a_key_of_the_config_has_its_name_in_messages(write):
+    options = {f"--{name.replace('_', '-')}" for name in inspect.signature(configure).parameters if name != "config"}
+    assert options <= set(FLAGS.values())
+    (line,) = problems(write(RIG), {"estimate.learned": 3})
+    assert line.startswith("--learned is 3, it must be a path")
 
 
 def test_a_calibration_may_lie_at_home(write, tmp_path, monkeypatch):
