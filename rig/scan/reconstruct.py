@@ -34,6 +34,8 @@ def reconstruct_cube(
     commands = column_commands(plan)
     geometry = map_geometry(model, commands, plan.depth_range)
     estimate, why = choose_estimator(estimate, geometry)
+    if why:
+        tell_stage(f"{estimate.estimator}: {why}")
     reconstructor = Reconstructor(model, commands, geometry, estimate)
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=False)
     tally = MapTally(plan.columns, plan.exposures, estimate.estimator, estimate.filter, why)

@@ -88,6 +88,15 @@ def test_a_foreign_cube_gives_its_wall(rig: Rig, wall: Path, estimator: str) -> 
     assert np.nanpercentile(error, 95) < 0.2
 
 
+def test_progress_says_which_estimator_auto_stands_for_and_why(
+    rig: Rig, wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rig.cli.progress.PATIENCE_S", 0.0)
+    why = "joint: no frame waits for its maps"
+    assert why in reconstruct(rig, wall).err
+    assert why not in reconstruct(rig, wall, "--estimator", "joint", "--out", "named").err
+
+
 def test_a_cube_that_speaks_against_its_depth_is_doubtful(rig: Rig, wall: Path) -> None:
     right = frames(2)
     maps = right.reshape(2, COLUMNS * EXPOSURES, ROWS, -1)
