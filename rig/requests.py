@@ -159,6 +159,22 @@ class TradeoffRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SoakRequest:
+    """A long stream at the sensor's rate, played in real time (`rig bench --soak`)."""
+
+    threads: int | None = option(None, "most threads to count and estimate with", unset="one a core", least=1)
+    seconds: float | None = option(
+        None, "also play so many seconds of stream in real time", unset="no stream; 60 in Python", name="soak"
+    )
+    window: bool = option(False, "stream of moving windows instead of whole frames")
+    slow_consumer_ms: float = option(0.0, "milliseconds added to every map of the stream", name="slow_consumer")
+    on_overload: str = option("abort", "where frames of the stream come too fast: abort, drop or block")
+    estimator: str = option("likelihood", "of the stream: argmax, edge, likelihood or joint")
+    exposures: int | None = option(None, "frames per column of the stream", unset="10", least=1)
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CutRequest:
     """A part of a recording (`rig cut`). Give exactly one of `maps`, `frames` and `time`."""
 

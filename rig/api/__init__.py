@@ -41,6 +41,7 @@ from rig.requests import (
     ReconstructRequest,
     ReplayRequest,
     ScanRequest,
+    SoakRequest,
     SyncRequest,
     TradeoffRequest,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "ReplayRequest",
     "RunResult",
     "ScanRequest",
+    "SoakRequest",
     "SyncRequest",
     "TradeoffRequest",
     "bench",

@@ -3,17 +3,17 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.config.models import MOST_THREADS, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure
 from rig.errors import UsageError
 from rig.progress import Progress
 
 if TYPE_CHECKING:
     from rig.bench.speed import SpeedReport
-    from rig.config.models import RigConfig
     from rig.devices.doctor import Attached, Finding
 
 
-def check_config(config: Config = SIMULATED) -> "RigConfig":
+def check_config(config: Config = SIMULATED) -> RigConfig:
     """Load a config, open every file that it names as a scan would, and return the config (`rig config check`).
 
     Raises UsageError with one line per problem.
@@ -56,13 +56,14 @@ def laser_off(config: Config = SIMULATED) -> list[str]:
 def bench(*, threads: int | None = None, progress: Progress | None = None) -> "SpeedReport":
     """Measure how fast this machine counts and estimates, within a minute (`rig bench`).
 
-    threads: the largest number of threads to measure with; None is one for each core. Raises UsageError if below 1.
+    threads: the largest number of threads to measure with, 1 to 256; None is one for each core. Raises UsageError for
+      any other number.
     progress: called with the number of rows done and the total, over all rounds.
     """
     from rig.bench.speed import measure_speed
 
-    if threads is not None and threads < 1:
-        raise UsageError(f"threads is {threads}; it must be at least 1")
+    if threads is not None and not 1 <= threads <= MOST_THREADS:
+        raise UsageError(f"threads is {threads}; it must be at least 1 and at most {MOST_THREADS}")
     return measure_speed(threads, progress=progress)
 
 

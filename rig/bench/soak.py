@@ -36,6 +36,7 @@ from rig.estimate.registry import ESTIMATORS
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.writer import Recording
+from rig.requests import SoakRequest
 from rig.run_folder.summary import PipelineStats
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
 from rig.scan.monitor import Listeners, MonitorView, ScanProgress
@@ -182,6 +183,8 @@ class LoopedSpad(SpadArray):
         return BlockLayout(n, self._loop.width, self._info.height)
 
 
+SECONDS = 60.0
+"""Length of the stream if the caller names none."""
 CONFIG = "simulated"
 EXIT_DEVICE = 3
 """Exit code of a scan that the overload policy ended."""
@@ -247,29 +250,20 @@ class SoakReport:
         return int(self.frames.lost > 0 or not self.frames.agree)
 
 
-def soak(
-    seconds: float = 60.0,
-    *,
-    threads: int | None = None,
-    window: bool = False,
-    slow_consumer_s: float = 0.0,
-    on_overload: str = "abort",
-    estimator: str = "likelihood",
-    exposures: int | None = None,
-    progress: Progress | None = None,
-) -> SoakReport:
+def soak(request: SoakRequest | None = None, *, progress: Progress | None = None, **changes: Any) -> SoakReport:
     """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
 
-    threads: 1 to 256 that count and estimate; None for one per core. window: send windows that move with the line, not
-    whole frames. slow_consumer_s: time added to every map, to see what an overload does. on_overload: as in
-    `rig.api.scan`; a stream that is ended by it gives a report too. estimator: its name. exposures: frames per column;
-    None for those of the bundled rig. progress: called with frames done and frames planned.
+    request, changes: options, as a `SoakRequest` or by the names of its fields: `soak(seconds=10, window=True)`. A
+      stream that the overload policy ends gives a report too.
+    progress: called with frames done and frames planned.
 
-    Raises UsageError for invalid arguments.
+    Raises UsageError for a request that cannot be met.
     """
-    policy = Overload.parse(on_overload)
-    if not (seconds > 0 and slow_consumer_s >= 0):
-        raise UsageError(f"a soak of {seconds:g} s, slowed by {slow_consumer_s:g} s; ask for more than 0 s")
+    request = replace(request or SoakRequest(), **changes)
+    seconds = SECONDS if request.seconds is None else request.seconds
+    policy, slow_s = Overload.parse(request.on_overload), request.slow_consumer_ms / 1e3
+    if not (seconds > 0 and slow_s >= 0):
+        raise UsageError(f"a soak of {seconds:g} s, slowed by {slow_s:g} s; ask for more than 0 s")
 
     def tell(done: ScanProgress) -> None:
         if progress is not None:
@@ -278,20 +272,20 @@ def soak(
     listeners = Listeners(
         live=tell,
         monitor=MonitorView.row_profile,  # what a viewer would show
-        sweeps=(lambda _: time.sleep(slow_consumer_s)) if slow_consumer_s else None,
+        sweeps=(lambda _: time.sleep(slow_s)) if slow_s else None,
     )
-    if estimator not in ESTIMATORS:
-        raise UsageError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
-    if threads is not None and not 1 <= threads <= MOST_THREADS:
-        raise UsageError(f"{threads} threads were asked for; give 1 to {MOST_THREADS}")
-    with _looped_rig(policy, window, exposures) as (rig, spad), _quiet_sweeps():
+    if request.estimator not in ESTIMATORS:
+        raise UsageError(f"estimator {request.estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if request.threads is not None and not 1 <= request.threads <= MOST_THREADS:
+        raise UsageError(f"{request.threads} threads were asked for; give 1 to {MOST_THREADS}")
+    with _looped_rig(policy, request) as (rig, spad), _quiet_sweeps():
         plan, timing = prepare(rig)
         maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
-        warm_up(estimator, "none", plan.exposures, dark=True)
-        settings = EstimateConfig.model_validate({"estimator": estimator, "threads": threads})
+        warm_up(request.estimator, "none", plan.exposures, dark=True)
+        settings = EstimateConfig.model_validate({"estimator": request.estimator, "threads": request.threads})
         maker = make_reconstructor(rig, plan, settings)
         asked = AcquisitionRequest(maps=maps, policy=policy, first_alone=True, learns=True, listeners=listeners)
-        return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, slow_consumer_s)
+        return _played(Acquisition(rig, plan, timing, maker, asked), spad, plan, asked, request.slow_consumer_ms)
 
 
 @contextmanager
@@ -307,15 +301,15 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(policy: Overload, window: bool, exposures: int | None) -> Iterator[tuple[OpenRig, LoopedSpad]]:
+def _looped_rig(policy: Overload, request: SoakRequest) -> Iterator[tuple[OpenRig, LoopedSpad]]:
     """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD."""
     # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {
         "scanner.clock_error": "0 ppm",
         "scan.depth_range": DEPTH_RANGE,
-        "scan.exposures": exposures,
+        "scan.exposures": request.exposures,
     }
-    if window:
+    if request.window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
     with open_rig(load_config(CONFIG, settings)) as rig:
         info = replace(rig.spad.info, model="looped", can_wait=False)
@@ -348,7 +342,7 @@ def _recorded(rig: OpenRig, plan: ScanPlan, timing: SpadTiming) -> Loop:
 
 
 def _played(
-    acquisition: Acquisition, spad: LoopedSpad, plan: ScanPlan, asked: AcquisitionRequest, slow_consumer_s: float
+    acquisition: Acquisition, spad: LoopedSpad, plan: ScanPlan, asked: AcquisitionRequest, slow_consumer_ms: float
 ) -> SoakReport:
     """Run the acquisition to its end and report on it."""
     resident: list[int] = []
@@ -380,7 +374,7 @@ def _played(
         seconds=exposed / float(plan.frame_rate_hz),
         frame_width=plan.frame_width,
         on_overload=asked.policy.value,
-        slow_consumer_ms=1e3 * slow_consumer_s,
+        slow_consumer_ms=slow_consumer_ms,
         maps=len(resident),
         maps_planned=asked.maps,
         frames=SoakFrames(exposed, counters.delivered, gone, expected, received, lost, agree),

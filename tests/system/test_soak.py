@@ -7,7 +7,7 @@ from rig.bench import soak as soaking
 from rig.errors import UsageError
 from rig.scan import pipeline as overload
 
-SLOW_S = 0.4
+SLOW_MS = 400.0
 """Four times what the ring holds, so that it overflows on any machine."""
 
 
@@ -18,7 +18,7 @@ def _short_loop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_drop_goes_on_and_accounts_for_every_frame() -> None:
-    found = soak(0.3, window=True, slow_consumer_s=SLOW_S, on_overload="drop")
+    found = soak(seconds=0.3, window=True, slow_consumer_ms=SLOW_MS, on_overload="drop")
     frames = found.frames
     assert found.ended_by is None
     assert found.maps == found.maps_planned
@@ -30,7 +30,7 @@ def test_drop_goes_on_and_accounts_for_every_frame() -> None:
 
 
 def test_abort_ends_at_the_first_block_without_a_slot() -> None:
-    found = soak(0.3, window=True, slow_consumer_s=SLOW_S, on_overload="abort")
+    found = soak(seconds=0.3, window=True, slow_consumer_ms=SLOW_MS, on_overload="abort")
     assert found.ended_by is not None
     assert "--on-overload drop" in found.ended_by
     assert 1 <= found.stages.dropped_blocks <= 2  # of each start of the SPAD at most one
@@ -42,4 +42,4 @@ def test_abort_ends_at_the_first_block_without_a_slot() -> None:
 
 def test_block_is_refused() -> None:
     with pytest.raises(UsageError, match=r"'block', but the looped SPAD cannot wait .*'abort' .* 'drop'"):
-        soak(0.3, window=True, on_overload="block")
+        soak(seconds=0.3, window=True, on_overload="block")

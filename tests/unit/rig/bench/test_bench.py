@@ -201,12 +201,15 @@ def test_options_without_effect_are_refused_before_a_minute_has_passed(monkeypat
 
 
 def test_what_cannot_be_asked_for_is_refused():
-    with pytest.raises(UsageError, match="threads is 0"):
-        api.bench(threads=0)
+    for threads in (0, 257):
+        with pytest.raises(UsageError, match=f"threads is {threads}; .* at most 256"):
+            api.bench(threads=threads)
+        with pytest.raises(UsageError, match=f"{threads} threads"):
+            api.soak(threads=threads)
     with pytest.raises(UsageError, match="more than 0 s"):
-        api.soak(0)
+        api.soak(seconds=0)
     with pytest.raises(UsageError, match="on-overload"):
-        api.soak(1, on_overload="wait")
+        api.soak(seconds=1, on_overload="wait")
 
 
 # The looped SPAD
