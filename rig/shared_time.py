@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class Spent:
+class ChargedTime:
     """Time in s that was charged to a piece of work; 0 until it is over."""
 
     seconds = 0.0
@@ -27,9 +27,9 @@ class SharedTime:
         self._at_s = 0.0
 
     @contextmanager
-    def charge(self) -> Iterator[Spent]:
+    def charge(self) -> Iterator[ChargedTime]:
         """Charge the work of a `with` block; its time is known afterwards."""
-        spent = Spent()
+        spent = ChargedTime()
         begun_s = self._step(1)
         try:
             yield spent

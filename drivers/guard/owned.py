@@ -59,7 +59,7 @@ RETRY_S = 0.1
 """Pause between attempts to make a device safe that does not answer or is not there."""
 
 
-class Owned:
+class GuardedDevice:
     """One device of the rig, with a lane for its ordinary jobs and another for jobs that must not wait for them."""
 
     def __init__(

@@ -27,7 +27,7 @@ from typing import Any
 from drivers.clock import SystemClock
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceTimeout, InterlockOpen
 from drivers.guard.channel import Channel, Heartbeat, Message, error_message
-from drivers.guard.owned import Owned, make_safe
+from drivers.guard.owned import GuardedDevice, make_safe
 from drivers.guard.watch import TICK_S, FrameWatch, GuardLimits, WatchedProcess, host_overloaded
 from drivers.interfaces import DeviceState, LineLaser
 from drivers.registry import Surroundings, lookup
@@ -64,7 +64,7 @@ class GuardProcess:
         self._channel = channel
         self._heartbeat = heartbeat
         self._watch = FrameWatch(GuardLimits())
-        self._owned: dict[str, Owned] = {}
+        self._owned: dict[str, GuardedDevice] = {}
         self._application: WatchedProcess | None = None
         self._tripped: DeviceError | None = None
         self._trip_lock = threading.Lock()
@@ -127,14 +127,14 @@ class GuardProcess:
         self._watch.limits = GuardLimits(**message["limits"])
         for slot, config in message["open"].items():
             try:
-                owned = Owned(slot, config, message["ports"], message["tap"], (self._trip, host_overloaded))
+                owned = GuardedDevice(slot, config, message["ports"], message["tap"], (self._trip, host_overloaded))
             except Exception as error:  # a config that is unusable here is reported to the application
                 self._channel.send({"opened": slot, "error": error_message(error)})
                 continue
             self._owned[slot] = owned
             owned.lane.do(partial(self._open_one, owned))
 
-    def _open_one(self, owned: Owned) -> None:
+    def _open_one(self, owned: GuardedDevice) -> None:
         answer: Message
         try:
             answer = {"opened": owned.slot, "about": owned.open()}
@@ -154,7 +154,7 @@ class GuardProcess:
         if verb in _URGENT and owned.enabling:
             owned.lane.do(owned.calm)  # undoes what the overtaken method may still do
 
-    def _answer(self, owned: Owned, message: Message) -> None:
+    def _answer(self, owned: GuardedDevice, message: Message) -> None:
         """Call a device's method and send its result or error. Runs on one of the device's lanes."""
         verb = message["verb"]
         answer: Message = {"id": message["id"]}
@@ -224,13 +224,13 @@ class GuardProcess:
             self._check_until = now + self._watch.limits.check_s
             sync.urgent.do(lambda: self._check_end(sync, trouble), first=True)
 
-    def _check_end(self, sync: Owned, trouble: str) -> None:
+    def _check_end(self, sync: GuardedDevice, trouble: str) -> None:
         """Trip the application unless the gate's program has ended by itself. Runs on one of the gate's lanes."""
         if not self._note_end(sync):
             self._trip_application(f"{trouble}; check the SPAD's cable and trigger, or unload the computer", False)
         self._check_until = None
 
-    def _note_end(self, sync: Owned) -> bool:
+    def _note_end(self, sync: GuardedDevice) -> bool:
         """Whether the gate's program has ended. If so, stops watching and pauses the laser. Runs on a gate's lane."""
         try:
             status = sync.device.status
@@ -244,7 +244,7 @@ class GuardProcess:
             laser.urgent.do(lambda: self._rest(laser))  # later requests of the application queue behind it
         return True
 
-    def _rest(self, laser: Owned) -> None:
+    def _rest(self, laser: GuardedDevice) -> None:
         """Pause the laser after the end of the gate's program. Runs on the laser's urgent lane."""
         try:
             laser.call("pause", [])
@@ -270,12 +270,12 @@ class GuardProcess:
             return
         self._next_alive = now + ALIVE_S
 
-    def _check_alive(self, laser: Owned) -> None:
+    def _check_alive(self, laser: GuardedDevice) -> None:
         """Ask the laser, on its lane, for a sign of life. Its silence trips by itself (`LineLaser.watch`)."""
         with suppress(DeviceError):  # what else is wrong, the next question about faults shows
             laser.device.check_alive()
 
-    def _ask_laser(self, laser: Owned) -> None:
+    def _ask_laser(self, laser: GuardedDevice) -> None:
         """Ask the laser, on its lane, about interlock and faults; a second time if an answer is missing or garbled."""
         device: LineLaser = laser.device
         for attempt in range(2):

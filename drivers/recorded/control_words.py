@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import accumulate
 
-from drivers.transports.tap import OUT, Passed
+from drivers.transports.tap import OUT, TapRecord
 
 _SERIAL, _NETWORK = "serial", "tcp"
 _LINE_END = re.compile(rb"[\r\n]")
@@ -36,23 +36,23 @@ mirror from wherever it happens to be."""
 
 
 @dataclass(frozen=True, slots=True)
-class Spoken:
+class SentCommands:
     """The commands sent to a rig. commands: by device. scans: point buffers by scan. Each piece has its time."""
 
-    commands: dict[str, list[Passed]]
-    scans: list[list[Passed]]
+    commands: dict[str, list[TapRecord]]
+    scans: list[list[TapRecord]]
 
     @classmethod
-    def of(cls, passed: Iterable[Passed]) -> "Spoken":
+    def of(cls, passed: Iterable[TapRecord]) -> "SentCommands":
         """Sort recorded traffic into commands by device and point buffers by scan. passed: the pieces from the taps, in
         order of time.
         """
-        sent: dict[tuple[str, str], list[Passed]] = defaultdict(list)
+        sent: dict[tuple[str, str], list[TapRecord]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:
                 sent[one.device, one.port].append(one)
-        commands: dict[str, list[Passed]] = {}
-        buffers: list[Passed] = []
+        commands: dict[str, list[TapRecord]] = {}
+        buffers: list[TapRecord] = []
         for (device, port), words in sent.items():
             if port == _NETWORK:
                 continue
@@ -66,7 +66,7 @@ class Spoken:
         return cls(commands, [] if ("sync", _NETWORK) in sent else _scans(commands.get("sync"), buffers))
 
 
-def _lines(pieces: list[Passed]) -> list[Passed]:
+def _lines(pieces: list[TapRecord]) -> list[TapRecord]:
     """The lines that are no queries. Each has the time of the piece in which it ends."""
     stream = b"".join(piece.data for piece in pieces)
     ends = list(accumulate(len(piece.data) for piece in pieces))
@@ -81,9 +81,9 @@ def _lines(pieces: list[Passed]) -> list[Passed]:
     return found
 
 
-def _once(words: list[Passed]) -> list[Passed]:
+def _once(words: list[TapRecord]) -> list[TapRecord]:
     """The commands without immediate repeats of one command or a pair of commands; drivers repeat when in doubt."""
-    kept: list[Passed] = []
+    kept: list[TapRecord] = []
     for word in words:
         kept.append(word)
         said = [one.data for one in kept[-4:]]
@@ -94,7 +94,7 @@ def _once(words: list[Passed]) -> list[Passed]:
     return kept
 
 
-def _scans(sync: list[Passed] | None, buffers: list[Passed]) -> list[list[Passed]]:
+def _scans(sync: list[TapRecord] | None, buffers: list[TapRecord]) -> list[list[TapRecord]]:
     """The buffers sent during each scan that was ended; without a sync source, all buffers, if any, as one scan."""
     if not buffers:
         return []

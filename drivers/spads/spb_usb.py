@@ -29,7 +29,7 @@ from drivers.spads.spb_usb_setup import (
     write_length,
 )
 from drivers.spb1.control import ControlChannel, Op, Register, SensorState
-from drivers.spb1.receiver import Armed, BlockReceiver, Took
+from drivers.spb1.receiver import Armed, BlockReceiver, ReadOutcome
 from drivers.transports.bulk_link import BulkLink, PlainLink, QueuedLink
 from drivers.transports.endpoints import Endpoint, resolve
 from drivers.transports.tap import Tap
@@ -186,8 +186,8 @@ class SpbUsb(SpadArray):
 
     def _fill(self, receiver: BlockReceiver, ring: BlockRing, timeout_s: float) -> bool:
         ends_at = now_s(self._clock) + timeout_s
-        took = Took.NOTHING
-        while took is not Took.FRAMES and not receiver.ended:
+        took = ReadOutcome.NOTHING
+        while took is not ReadOutcome.FRAMES and not receiver.ended:
             self._ping_when_due(receiver)
             asked_at = now_s(self._clock)
             try:
@@ -197,20 +197,20 @@ class SpbUsb(SpadArray):
             if self._halt.is_set():
                 return False
             now = now_s(self._clock)
-            if took is Took.FRAMES:
+            if took is ReadOutcome.FRAMES:
                 self._waited_s = 0.0
             else:
                 self._note_wait(min(now - asked_at, _SLICE_S))
-            if took is not Took.NOTHING:
+            if took is not ReadOutcome.NOTHING:
                 self._heard_at = now
             elif now - self._heard_at >= _SILENCE_S and self._has_ended():
                 break
-            if took is not Took.FRAMES and now >= ends_at and not receiver.ended:
+            if took is not ReadOutcome.FRAMES and now >= ends_at and not receiver.ended:
                 raise DeviceTimeout(
                     f"{self.name} sent no frames for {timeout_s:g} s ({self._counters.crc_errors} damaged blocks so "
                     "far); check trigger and cable"
                 )
-        if took is Took.FRAMES and not receiver.ended:
+        if took is ReadOutcome.FRAMES and not receiver.ended:
             return True
         self._finish(receiver)
         return False

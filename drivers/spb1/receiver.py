@@ -50,7 +50,7 @@ class Armed:
     check_payload: bool
 
 
-class Took(Enum):
+class ReadOutcome(Enum):
     """Outcomes of a read."""
 
     NOTHING = "nothing came in time"
@@ -102,18 +102,18 @@ class BlockReceiver:
         """Bytes to read until the next read begins where a block begins."""
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
-    def take(self, ring: BlockRing, timeout_s: float) -> Took:
+    def take(self, ring: BlockRing, timeout_s: float) -> ReadOutcome:
         """Wait for the next read and process it. Raises the link's errors, `UnsupportedBlock`, and, after counting the
         frames, what `ring.mark_overflow` raises."""
         self._ring = ring
         self._top_up(ring)
         reaped = self._link.reap(timeout_s)
         if reaped is None:
-            return Took.NOTHING
+            return ReadOutcome.NOTHING
         item = self._items.popleft()
         if not item.use:
             self._give_back(item)
-            return Took.CONTROL
+            return ReadOutcome.CONTROL
         return self._judge(item, item.buffer[: reaped[1]])
 
     def drain(self, timeout_s: float) -> bool:
@@ -179,8 +179,8 @@ class BlockReceiver:
         elif self._ring is not None:
             self._ring.discard()
 
-    def _judge(self, item: _Item, data: Buffer) -> Took:
-        took = Took.CONTROL
+    def _judge(self, item: _Item, data: Buffer) -> ReadOutcome:
+        took = ReadOutcome.CONTROL
         try:
             fields = read_header(data)
             if not fields.is_control and fields.block.run_id == self._armed.run_id:
@@ -188,16 +188,16 @@ class BlockReceiver:
                 block = read_frames(data, fields, check_payload=self._armed.check_payload)
                 self._require_windows(block)
                 self._note(fields, block.n_frames)
-                took = Took.FRAMES if block.n_frames else Took.CONTROL
+                took = ReadOutcome.FRAMES if block.n_frames else ReadOutcome.CONTROL
         except CorruptBlock as error:
             self.crc_errors += 1
             _log.warning("%s: block refused: %s", self._label, error)
             self._find_step(data)
-            took = Took.REFUSED
+            took = ReadOutcome.REFUSED
         finally:
-            if took is not Took.FRAMES:
+            if took is not ReadOutcome.FRAMES:
                 self._give_back(item)
-        if took is Took.FRAMES:
+        if took is ReadOutcome.FRAMES:
             self._hand_over(item, fields, block)
         return took
 

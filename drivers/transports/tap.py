@@ -112,7 +112,7 @@ def _write(path: str, lines: _Lines) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Passed:
+class TapRecord:
     """A piece of bytes that passed a port."""
 
     t_ns: int
@@ -122,7 +122,7 @@ class Passed:
     data: bytes
 
 
-def read_taps(file: Path) -> list[Passed]:
+def read_taps(file: Path) -> list[TapRecord]:
     """All pieces that passed, in order of time, without a torn last line. Raises `ProtocolError` for a line of another
     form, OSError if the file cannot be read.
     """
@@ -130,15 +130,15 @@ def read_taps(file: Path) -> list[Passed]:
     found = []
     for number, line in enumerate(lines, 1):
         try:
-            found.append(_passed(parse_json(line)))
+            found.append(_record(parse_json(line)))
         except (ArithmeticError, KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"{file}, line {number} is not as it was written: {error!r}") from None
     return sorted(found, key=lambda passed: passed.t_ns)
 
 
-def _passed(line: dict[str, Any]) -> Passed:
+def _record(line: dict[str, Any]) -> TapRecord:
     if line["dir"] not in (OUT, IN):
         raise ValueError(f"direction {line['dir']!r}")
-    return Passed(
+    return TapRecord(
         int(line["t_ns"]), str(line["device"]), str(line["port"]), str(line["dir"]), bytes.fromhex(line["bytes"])
     )

@@ -14,7 +14,7 @@ from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter,
 from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import RowModel, line_profile
 from rig.estimate.search.confidence import believed
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, Seen, first_model
+from rig.estimate.search.online_learning import LearningSetting, LessonInput, OnlineLearner, first_model
 from rig.estimate.search.prepare import judge_of, signal_reach
 from rig.estimate.search.rows import SearchTables
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume
@@ -66,7 +66,7 @@ class Likelihood:
         self.used = used
         # Learning goes row by row, so by each row's own confidence, without its neighbours.
         self._lessons.attend(
-            found, used, int(sweep.n_frames.sum()), lambda: Seen(sweep, sweep.intensity(), quiet, lines)
+            found, used, int(sweep.n_frames.sum()), lambda: LessonInput(sweep, sweep.intensity(), quiet, lines)
         )
         return believed(found, self._reference(geometry), sweep.n_frames, *self._light_of(used), self._workers)
 

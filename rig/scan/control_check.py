@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.recorded.control_words import Spoken
-from drivers.transports.tap import Passed, read_taps
+from drivers.recorded.control_words import SentCommands
+from drivers.transports.tap import TapRecord, read_taps
 
 SWAP_TOLERANCE_S = 2e-3
 """Longest time by which a buffer may come earlier or later than in the recording."""
@@ -49,7 +49,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
     devices: those whose drivers took part in the replay. tolerance_s: most by which a buffer may come too early or too
     late; None allows any time. Raises ProtocolError if a file is not one of control traffic.
     """
-    before, after = Spoken.of(read_taps(recorded)), Spoken.of(read_taps(now) if now.exists() else ())
+    before, after = SentCommands.of(read_taps(recorded)), SentCommands.of(read_taps(now) if now.exists() else ())
     problems: list[str] = []
     commands = swaps = 0
     for device in devices:
@@ -71,7 +71,7 @@ def check_control(recorded: Path, now: Path, *, devices: Sequence[str], toleranc
     return ControlCheck(commands, swaps, worst_s, tuple(problems))
 
 
-def _first_difference(device: str, what: str, said: list[Passed], says: list[Passed], *, tail: int) -> str | None:
+def _first_difference(device: str, what: str, said: list[TapRecord], says: list[TapRecord], *, tail: int) -> str | None:
     """Describe the first difference: another byte, or over `tail` commands missing or added at the end; else None."""
     for number, (old, new) in enumerate(zip(said, says, strict=False)):
         if old.data != new.data:
@@ -89,7 +89,7 @@ def _first_difference(device: str, what: str, said: list[Passed], says: list[Pas
     return f"{device}: {what} {len(said)} was not recorded: {_shown(says[len(said)].data, 0)}"
 
 
-def _swaps_off(said: list[Passed], says: list[Passed]) -> list[float]:
+def _swaps_off(said: list[TapRecord], says: list[TapRecord]) -> list[float]:
     """Seconds by which each buffer came later than recorded, less the median of its scan.
 
     The second buffer gets 0: a device takes it as soon as the host has it, so its time depends on the host alone.

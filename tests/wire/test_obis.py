@@ -172,11 +172,11 @@ def test_the_port_has_the_rate_of_the_config() -> None:
 def test_trap_the_upper_status_bits_tell_of_key_and_interlock(
     word: int, emission: bool, closed: bool, key_on: bool
 ) -> None:
-    class Seen(ObisModel):
+    class FixedStatus(ObisModel):
         def _bits(self) -> int:
             return word
 
-    with wire(Seen()) as (_, surroundings):
+    with wire(FixedStatus()) as (_, surroundings):
         laser = open_obis(surroundings)
         status = laser.status
         assert (status.emission, status.interlock_closed, status.key_on) == (emission, closed, key_on)

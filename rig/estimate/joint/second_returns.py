@@ -69,7 +69,7 @@ class Candidates(NamedTuple):
     haze: Float32
 
 
-class Seconds(NamedTuple):
+class SecondReturns(NamedTuple):
     """Candidates of second returns, float32 (rows, columns) each.
 
     distance: from the far end in px, NaN if there is no candidate; ones, expected: ones counted and expected within
@@ -162,7 +162,7 @@ def _stands_out(sums: Float32, i: int, reach: int) -> tuple[float, float]:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def measure_seconds(
     counts: Counts, n_frames: Int32, sweep: Sweep, state: RowState, still: Float32, x_far: Float64, side: int,
-    apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: Seconds,
+    apart: float, reach: int, x_px: Float32, haze: Float32, first_row: int, last_row: int, out: SecondReturns,
 ) -> None:  # fmt: skip
     """Fill ones, expected, light and moment of rows first_row..last_row-1 for candidates at `out.distance`.
 
@@ -202,7 +202,7 @@ def measure_seconds(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) -> None:
+def move_seconds(reach: int, first_row: int, last_row: int, seconds: SecondReturns) -> None:
     """Fill moved: each candidate's distance after a shift by up to `reach` px to the centroid of the light around it,
     pooled over neighbours."""
     moved = seconds.moved
@@ -221,7 +221,7 @@ def move_seconds(reach: int, first_row: int, last_row: int, seconds: Seconds) ->
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def judge_seconds(
-    x_far: Float64, x_px: Float32, sure: Float32, first_row: int, last_row: int, seconds: Seconds, x2_px: Float32,
+    x_far: Float64, x_px: Float32, sure: Float32, first_row: int, last_row: int, seconds: SecondReturns, x2_px: Float32,
     confidence2: Float32,
 ) -> None:  # fmt: skip
     """Fill x2_px and confidence2 of rows first_row..last_row-1; NaN and 0 where nothing stands out.
@@ -285,7 +285,7 @@ class SecondRoom(NamedTuple):
 
     blocks: Blocks
     candidates: Candidates
-    seconds: Seconds
+    seconds: SecondReturns
 
 
 def second_room(grid: LabelGrid) -> SecondRoom:
@@ -295,7 +295,7 @@ def second_room(grid: LabelGrid) -> SecondRoom:
     return SecondRoom(
         Blocks(*(aligned_zeros((*shape, grid.labels // PER_PX), np.float32) for _ in Blocks._fields)),
         Candidates(*(np.empty(shape, np.float32) for _ in Candidates._fields)),
-        Seconds(*(np.empty((rows, columns), np.float32) for _ in Seconds._fields)),
+        SecondReturns(*(np.empty((rows, columns), np.float32) for _ in SecondReturns._fields)),
     )
 
 
@@ -370,8 +370,8 @@ def find_specks(
     """Fill speck (rows, columns), whether answers of rows first_row..last_row-1 are specks before a lit surface.
 
     distance, distance2: of answer and second return from the far end in px, NaN where there is none; signal: of
-    `StripeTable`; ones, expected: of `Seconds`. The light is tested on the speck's own row, since the wall around a
-    small opaque thing is lit too. All float32 (rows, columns).
+    `StripeTable`; ones, expected: of `SecondReturns`. The light is tested on the speck's own row, since the wall around
+    a small opaque thing is lit too. All float32 (rows, columns).
     """
     rows, columns = distance.shape
     for y in range(first_row, last_row):

@@ -25,7 +25,7 @@ from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, Ballots, collect, new_ballots, vote
 from rig.estimate.joint.winner import LabelAnswers, new_answer, new_readout
 from rig.estimate.row.em import lines_of, next_lattice
-from rig.estimate.search.online_learning import Seen
+from rig.estimate.search.online_learning import LessonInput
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32, Float64, Uint8
@@ -115,12 +115,14 @@ class MapSolver:
         )  # fmt: skip
         return replace(stripes, confidence=trust)
 
-    def seen(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Seen:
+    def seen(
+        self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable
+    ) -> LessonInput:
         """The part of the last map from which the next model is learned. stripes: the map's stripe table."""
         quiet = self.quiet(volume, geometry, tables, stripes)
         lines = lines_of(volume, next_lattice(geometry), stripes)
         bright = bright_lines(volume, tables, stripes, self.places, self._workers)
-        return Seen(volume, volume.intensity(self._workers), quiet, lines, bright)
+        return LessonInput(volume, volume.intensity(self._workers), quiet, lines, bright)
 
     def quiet(self, volume: CountVolume, geometry: SweepGeometry, tables: JointTables, stripes: StripeTable) -> Float64:
         """Ones and exposures of pixels behind clear stripes (2, rows, width), see `ambient_map`."""

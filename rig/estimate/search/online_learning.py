@@ -70,7 +70,7 @@ class LearningSetting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class LessonInput:
     """The part of a sweep that is used for learning.
 
     tally: of the sweep; intensity: as returned by the tally; quiet: ones and exposures of pixels behind clear stripes,
@@ -87,8 +87,8 @@ class Seen:
 class OnlineLearner(Generic[Tables]):
     """The model that an estimator uses, None until a map was good enough to learn from, and the tables made for it.
 
-    make: makes tables. learn_more: learns from `more` of a `Seen`, in addition to what every estimator learns. Both run
-    on the learning thread, `make` also on the caller's. learns: whether later maps change the model.
+    make: makes tables. learn_more: learns from `more` of a `LessonInput`, in addition to what every estimator learns.
+    Both run on the learning thread, `make` also on the caller's. learns: whether later maps change the model.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class OnlineLearner(Generic[Tables]):
             self._made = setting, self._make(setting, workers)
         return self._made[1]
 
-    def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], Seen]) -> None:
+    def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], LessonInput]) -> None:
         """Take note of a map: begin a lesson from it if one is due, or take over the model of the last lesson.
 
         used: the model that the map was estimated with; frames: its lit frames; see: called if the map is used.
@@ -151,7 +151,7 @@ class OnlineLearner(Generic[Tables]):
             self.model, self._made = setting.model, (setting, tables)
 
     def _teach(
-        self, setting: LearningSetting, seen: Seen, before: Expectation | None
+        self, setting: LearningSetting, seen: LessonInput, before: Expectation | None
     ) -> tuple[LearningSetting, Expectation, Tables]:
         """Learn from one sweep, on the learning thread: the new setting, the sums for the next lesson, new tables."""
         ambient = ambient_map(seen.tally, seen.intensity, setting.geometry, seen.quiet)

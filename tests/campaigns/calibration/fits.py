@@ -17,7 +17,7 @@ from calibration.errors import CalibrationError
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import MAD_TO_SD
 from tests.campaigns.calibration.asked import INSIDE, RATIO, Figure, exit_code
-from tests.reference.boards.calibration_data import BOARD, Seen, depth_errors, random_rig, random_views
+from tests.reference.boards.calibration_data import BOARD, ViewErrors, depth_errors, random_rig, random_views
 
 AT_M = 5.0
 
@@ -26,7 +26,7 @@ def one_rig(seed: int, passages: int = 600) -> tuple[RigFit, np.ndarray, np.ndar
     """(fit, depth errors, their stated sd) of a random rig, noise, speed and sequence of poses."""
     rng = np.random.default_rng(seed)
     rig = random_rig(rng)
-    seen = Seen(
+    seen = ViewErrors(
         jitter=float(rng.choice([0, 2e-5, 5e-5, 1e-4, 2e-4])),
         corner_px=rng.uniform(0.02, 0.1),
         passage=10 ** rng.uniform(-3.5, -2.7),

@@ -18,7 +18,7 @@ from calibration.errors import CalibrationError
 from calibration.guide import Forecast, candidates, next_pose, rough_camera, sequence
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
-from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_rig, seen_view
+from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_rig, seen_view
 
 AT_M = 5.0
 DEPTH_RANGE_M = (0.5, 4.0)
@@ -42,7 +42,7 @@ def session(seed: int) -> Iterator[Step]:
     rng = np.random.default_rng(seed)
     rig = random_rig(rng)
     size = (rig.width, rig.height)
-    seen = Seen(
+    seen = ViewErrors(
         jitter=float(rng.choice([0, 2e-5, 5e-5, 1e-4, 2e-4])),
         corner_px=rng.uniform(0.02, 0.1),
         passage=10 ** rng.uniform(-3.5, -2.7),

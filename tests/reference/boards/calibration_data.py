@@ -103,7 +103,7 @@ class TrueRig:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ViewErrors:
     """Errors of what is seen. factor: of the passages' errors to their stated sd. wave: (amplitude, turns over the
     sweep) of an exposure that is not locked.
     """
@@ -162,7 +162,7 @@ def random_pose(rng: np.random.Generator, rig: TrueRig, near: float = 0.8, far: 
 
 
 def seen_view(
-    rng: np.random.Generator, rig: TrueRig, turn: Array, position: Array, seen: Seen,
+    rng: np.random.Generator, rig: TrueRig, turn: Array, position: Array, seen: ViewErrors,
     velocities: tuple[float, ...] = (35.2, -35.2), name: str = "view",
 ) -> View:  # fmt: skip
     """One pose of the board, with a sweep for each signed velocity."""
@@ -176,7 +176,7 @@ def seen_view(
 
 
 def _sweep(
-    rng: np.random.Generator, rig: TrueRig, matrix: Array, position: Array, seen: Seen, velocity: float
+    rng: np.random.Generator, rig: TrueRig, matrix: Array, position: Array, seen: ViewErrors, velocity: float
 ) -> Passages:
     places = rng.uniform([0, 0], BOARD.size_m, (3 * seen.passages, 2))
     points = np.hstack([places, np.zeros((len(places), 1))]) @ matrix.T + position
@@ -208,7 +208,7 @@ def _shaken(rng: np.random.Generator, command: Array, velocity: float) -> Array:
 
 
 def random_views(
-    rng: np.random.Generator, rig: TrueRig, poses: int, seen: Seen, velocities: tuple[float, ...] = (35.2, -35.2)
+    rng: np.random.Generator, rig: TrueRig, poses: int, seen: ViewErrors, velocities: tuple[float, ...] = (35.2, -35.2)
 ) -> list[View]:
     """Views of so many random poses."""
     shown = [random_pose(rng, rig) for _ in range(poses)]
@@ -242,12 +242,12 @@ def depth_errors(
 
 
 SIZE = (512, 512)
-SEEN = Seen(passages=200, passage=1e-3, corner_px=0.04)
-EXACT = Seen(passages=200, passage=1e-3, factor=1e-6, corner_px=1e-7)
+SEEN = ViewErrors(passages=200, passage=1e-3, corner_px=0.04)
+EXACT = ViewErrors(passages=200, passage=1e-3, factor=1e-6, corner_px=1e-7)
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02), lag=(1.5e-4, 2.5e-4))
 
 
-def fitted(rig: TrueRig, seed: int, seen: Seen = SEEN, poses: int = 8, **given: object) -> RigFit:
+def fitted(rig: TrueRig, seed: int, seen: ViewErrors = SEEN, poses: int = 8, **given: object) -> RigFit:
     velocities = given.pop("velocities", (35.2, -35.2))
     views = random_views(np.random.default_rng(seed), rig, poses, seen, velocities)
     return fit_rig(views, BOARD, SIZE, **given)

@@ -12,7 +12,7 @@ from calibration.guide import Forecast, candidates, next_pose, rough_camera, seq
 from calibration.model.camera import Camera
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose
-from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_pose, random_views, seen_view
+from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_pose, random_views, seen_view
 from tests.stability.inventory import covers
 
 covers(guide)
@@ -68,7 +68,7 @@ def test_the_next_pose_is_the_one_with_the_least_expected_error() -> None:
 
 
 RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53, 0.02))
-SEEN = Seen(passages=300, passage=5e-4, corner_px=0.04)
+SEEN = ViewErrors(passages=300, passage=5e-4, corner_px=0.04)
 
 
 SPEEDS = (35.2, 117.0, 17.6)

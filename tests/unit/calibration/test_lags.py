@@ -35,7 +35,7 @@ ONE = (("lag_forward", "lag_backward"),)
 
 @cache
 def planes(*velocities: float, seed: int = 3) -> tuple[RigFit, list[View]]:
-    views = data.random_views(np.random.default_rng(seed), RIG, 7, data.Seen(passages=150), velocities)
+    views = data.random_views(np.random.default_rng(seed), RIG, 7, data.ViewErrors(passages=150), velocities)
     return fit_rig(views, data.BOARD, SIZE), views
 
 
@@ -163,7 +163,12 @@ def test_a_line_that_does_not_reach_the_distance_asked_is_refused_with_its_reach
     views: list[View] = []
     while len(views) < 8:
         view = data.seen_view(
-            rng, near, *data.random_pose(rng, near, 0.5, 0.9), data.Seen(passages=200), (35.2, -35.2), str(rng.random())
+            rng,
+            near,
+            *data.random_pose(rng, near, 0.5, 0.9),
+            data.ViewErrors(passages=200),
+            (35.2, -35.2),
+            str(rng.random()),
         )
         if min(len(sweep.x_px) for sweep in view.passages) > 100:
             views.append(view)

@@ -111,7 +111,7 @@ def test_light_that_passes_the_axis_does_not_stand_in_for_an_angle_that_bends() 
     """It did here: the fit never came to rest, 35 mm off at 5 m, the baseline known to 84 mm."""
     rng = np.random.default_rng([46, 5])
     rig = data.TrueRig(fx=860.0, fy=860.0, angle=(0.09, 0.33, *rng.choice([-1, 1], 2) * [0.006, 0.01]))
-    seen = data.Seen(passages=200, passage=8e-4, corner_px=0.01)
+    seen = data.ViewErrors(passages=200, passage=8e-4, corner_px=0.01)
     views = [
         data.seen_view(rng, rig, *data.random_pose(rng, rig, 1.6, 3.2), seen, (88.0, -88.0), str(i)) for i in range(8)
     ]
@@ -210,7 +210,7 @@ def test_every_derivative_is_that_of_the_residual(lens: int) -> None:
         cone_rad=0.02,
     )
     rig = data.TrueRig()
-    view = data.seen_view(np.random.default_rng(0), rig, turn, position, data.Seen(passages=60, passage=1e-3))
+    view = data.seen_view(np.random.default_rng(0), rig, turn, position, data.ViewErrors(passages=60, passage=1e-3))
     pose = BoardPose(turn, position)
     seen = sighting(view, data.BOARD, camera, pose)
     terms = Terms(lens)

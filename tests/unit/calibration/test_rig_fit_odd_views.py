@@ -24,7 +24,7 @@ from tests.reference.boards import calibration_data as data
 pytestmark = pytest.mark.slow
 
 
-def seen_by(rng: np.random.Generator, *rigs: data.TrueRig, seen: data.Seen = data.SEEN) -> list[View]:
+def seen_by(rng: np.random.Generator, *rigs: data.TrueRig, seen: data.ViewErrors = data.SEEN) -> list[View]:
     """A view by each of several rigs, which have the same camera."""
     return [data.seen_view(rng, rig, *data.random_pose(rng, rig), seen, name=str(i)) for i, rig in enumerate(rigs)]
 
@@ -126,7 +126,7 @@ def with_more(sweep: Passages, points: np.ndarray, px: np.ndarray) -> Passages:
 
 
 STEADY = data.TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0), angle=(0.09, 0.53))
-PLAIN = data.Seen(passages=200)
+PLAIN = data.ViewErrors(passages=200)
 
 
 def test_views_with_poor_corners_and_single_wrong_ones_are_no_moved_rig() -> None:
@@ -147,7 +147,7 @@ def test_views_with_poor_corners_and_single_wrong_ones_are_no_moved_rig() -> Non
 def test_a_knock_is_named_that_the_fit_has_nearly_made_up_for() -> None:
     """What views contradict each other by is less than the accuracy asked, and depth off by three times as much."""
     rng = np.random.default_rng(34)
-    rig, seen = data.random_rig(rng), data.Seen(passages=200, corner_px=0.02, passage=5e-4)
+    rig, seen = data.random_rig(rng), data.ViewErrors(passages=200, corner_px=0.02, passage=5e-4)
     moved = rig.moved(np.array([0.001, 0, 0.002]), np.zeros(3))
     views = seen_by(rng, *[rig] * 4, *[moved] * 5, seen=seen)
     fit = fit_rig(views, data.BOARD, data.SIZE)

@@ -18,7 +18,7 @@ from calibration.rig_fit.fit import SweepFit, fit_rig
 from calibration.sync.lag_fit import SweepTiming, SyncFit
 from calibration.verdict import AccuracyGoal, Verdict, unguided
 from calibration.views import Corners, View
-from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_views
 from tests.stability.inventory import covers
 from tests.unit.calibration.cameras import camera
 
@@ -117,7 +117,7 @@ def test_views_that_cannot_be_used_do_not_count_as_poses() -> None:
 
 
 def test_views_without_board_or_line_are_no_poses_of_a_fit() -> None:
-    seen = random_views(np.random.default_rng(4), TrueRig(), 7, Seen(passages=60))
+    seen = random_views(np.random.default_rng(4), TrueRig(), 7, ViewErrors(passages=60))
     views = [*seen[:4], View("a", None), View("b", None), replace(seen[5], passages=()), replace(seen[6], passages=())]
     fit = fit_rig(views, BOARD, (512, 512))
     assert (len(fit.used), fit.left_out, fit.without_line) == (4, ("a", "b"), ("005", "006"))

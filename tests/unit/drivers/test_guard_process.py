@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from drivers.errors import DeviceError, DeviceTimeout, ProtocolError
-from drivers.guard.owned import Owned
+from drivers.guard.owned import GuardedDevice
 from drivers.guard.process import ALIVE_S, POLL_S, GuardProcess
 from drivers.guard.watch import TICK_S
 from drivers.interfaces import LaserStatus
@@ -72,8 +72,8 @@ class Laser(PlainLaser):
 CONFIGS = {"laser": {"kind": "ttl", "power": "20 mW", "max_power": "50 mW"}, "sync": {"kind": "prawndo", "port": "x"}}
 
 
-def owned(slot: str, device: Any, process: GuardProcess, does: list[str]) -> Owned:
-    made = Owned(slot, CONFIGS[slot], {}, None, (process._trip, lambda: False))
+def owned(slot: str, device: Any, process: GuardProcess, does: list[str]) -> GuardedDevice:
+    made = GuardedDevice(slot, CONFIGS[slot], {}, None, (process._trip, lambda: False))
     made.device = device
     made.lane, made.urgent = Lane(does, slot), Lane(does, f"{slot}, urgent")  # type: ignore[assignment]
     process._owned[slot] = made

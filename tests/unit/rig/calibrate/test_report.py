@@ -12,11 +12,11 @@ from calibration.model.rig_model import Identity
 from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Verdict
 from rig.calibrate.report import measured, page, paragraph, planes_report, subject
-from tests.reference.boards.calibration_data import BOARD, Seen, TrueRig, random_views
+from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_views
 
 
 def test_the_report_of_planes_shows_text_first_then_the_four_pictures() -> None:
-    views = random_views(np.random.default_rng(1), TrueRig(), 8, Seen(passages=200), (35.2, -35.2))
+    views = random_views(np.random.default_rng(1), TrueRig(), 8, ViewErrors(passages=200), (35.2, -35.2))
     fit = fit_rig(views, BOARD, (512, 512))
     judged = judge_fit(fit, views, stated_baseline_m=0.3)
     report, line = planes_report(fit, views, judged), judged.uncertainty.line()

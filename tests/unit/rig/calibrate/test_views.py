@@ -24,7 +24,7 @@ from rig.calibrate.session import Session
 from rig.calibrate.views import take_live
 from rig.errors import PlanError, UsageError
 from rig.requests import PlanesRequest
-from tests.reference.boards.calibration_data import BOARD, SIZE, Seen, TrueRig, random_views, true_camera
+from tests.reference.boards.calibration_data import BOARD, SIZE, TrueRig, ViewErrors, random_views, true_camera
 
 pytestmark = pytest.mark.slow
 
@@ -148,7 +148,7 @@ RIG = TrueRig(lens=(-0.1, 0.03, 5e-4, -3e-4, 0.0))
 
 def three_views(asked: dict[str, float], camera: KnownCamera | None = None) -> tuple[Any, Any, Any]:
     """A session of three views, and how it is fitted and judged."""
-    views = random_views(np.random.default_rng(4), RIG, 3, Seen(passages=150))
+    views = random_views(np.random.default_rng(4), RIG, 3, ViewErrors(passages=150))
     session = SimpleNamespace(views=views, size=SIZE, say=lambda line: None)
     fit = partial(planes_run._fit, session, BOARD, None, camera)
     return session, fit, partial(planes_run._judged, session, asked)

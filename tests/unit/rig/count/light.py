@@ -38,7 +38,7 @@ def blanked_plan(**changes: object) -> ScanPlan:
 
 
 @dataclass(frozen=True)
-class Seen:
+class BurstFrames:
     """All frames of a burst. ones, share: (n,) bits set, share of the exposure with light. mirror: (n,) command.
 
     scan_frame: place of each scan marker, in frames.
@@ -51,7 +51,7 @@ class Seen:
     period_ticks: int
     exposure_ticks: int
 
-    def without(self, frames: Iterable[int]) -> "Seen":
+    def without(self, frames: Iterable[int]) -> "BurstFrames":
         """The same, but the device has dropped these frames and does not say so."""
         keep = np.ones(len(self.ones), bool)
         keep[list(frames)] = False
@@ -96,7 +96,7 @@ def see(
     sync_error: float = 0.0,
     seed: int = 0,
     scene: float = 0.2,
-) -> Seen:
+) -> BurstFrames:
     """A burst of `maps` maps; brightness, level: mean ones of a frame with and without light, over the whole picture.
 
     scanner_error, sync_error: relative excess of their clocks over the SPAD's. scene: how much the light varies.
@@ -121,7 +121,7 @@ def see(
     at = (start + plan.exposure_s / 2 - latency_s) * rate
     back = (words[np.clip(at.astype(np.int64), 0, len(words) - 1)] & LEVEL_BACKWARD) != 0
     late = np.where(back, LAG.backward, LAG.forward) * rate
-    return Seen(
+    return BurstFrames(
         ones=rng.poisson(level + brightness * glow * share),
         share=share,
         mirror=np.interp(at - late, np.arange(len(command)), command),

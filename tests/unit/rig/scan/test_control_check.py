@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ProtocolError
-from drivers.recorded.control_words import Spoken
+from drivers.recorded.control_words import SentCommands
 from drivers.transports.tap import CONTROL_FILE, IN, OUT, Tap, TapFile, read_taps
 from rig.scan.control_check import ControlCheck, check_control
 
@@ -169,7 +169,7 @@ def test_taps_of_several_devices_write_one_file_and_are_read_in_time(tmp_path: P
         ("scanner", "02", OUT, bytes(range(256))),
         ("laser", "serial", IN, b"OK\r\n"),
     ]
-    assert Spoken.of(passed).commands["laser"] == []
+    assert SentCommands.of(passed).commands["laser"] == []
     (tmp_path / CONTROL_FILE).write_text("{}\n")
     with pytest.raises(ProtocolError, match="line 1"):
         read_taps(tmp_path / CONTROL_FILE)
