@@ -29,13 +29,14 @@ import re
 import threading
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
-from drivers.clock import now_s
+from drivers.clock import Clock, now_s
 from drivers.errors import (
     GONE,
     DeviceError,
@@ -90,6 +91,10 @@ class _Run:
     count: SweepCount | None
     aborts: int
     over: threading.Event = field(default_factory=threading.Event)
+
+    def pause_s(self, now_s: float) -> float:
+        """Time until the box is to be asked again."""
+        return IDLE_POLL_S if self.count is None else self.count.pause_s(now_s)
 
 
 class PulseStreamerConfig(BoardConfig):
@@ -232,7 +237,8 @@ class PulseStreamer(SyncBoard):
         except WrongState:
             self._lower()  # the thread that interrupted may have failed to
             raise
-        threading.Thread(target=self._watch, args=(run,), name="Pulse Streamer", daemon=True).start()
+        watched = weakref.ref(self), run, self._clock
+        threading.Thread(target=_watch, args=watched, name="Pulse Streamer", daemon=True).start()
 
     def _require_no_abort(self, aborts: int) -> None:
         if self._aborts != aborts:
@@ -297,28 +303,32 @@ class PulseStreamer(SyncBoard):
                     self._lower("stopped")
         return ended or run.over.is_set()
 
-    def _watch(self, run: _Run) -> None:
-        """Count the sweeps of a program until it is over. On an error set `port_lost` and try to take outputs low."""
+    def _look(self, run: _Run, checked_s: float) -> float | None:
+        """Ask whether a program plays, and count. On an error set `port_lost` and try to take the outputs low.
+
+        checked_s: time when the trigger was last looked at; returns it for the next call, or None after an error.
+        """
         ask = partial(self._rpc.ask, silence_s=self._config.silence)
-        checked_s = now_s(self._clock)
-        while not run.over.wait(IDLE_POLL_S if run.count is None else run.count.pause_s(now_s(self._clock))):
-            try:
-                asked_s = now_s(self._clock)
-                plays = self._flag("isStreaming", ask)
-                ended = self._has_ended(run, asked_s, plays, ask)
-                if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
-                    self._check_trigger(RISING, ask)
-                    checked_s = asked_s
-            except Exception as error:
-                if not run.over.is_set():
-                    advice = "the gate may open at every scan marker, turn the laser off by its key"
-                    _log.error("%s: while a program runs: %s; %s", self.name, error, advice)
-                    self._lost = True
-                while not run.over.is_set():  # the box goes on by itself, and the network may come back
-                    try:
-                        self._lower()
-                    except DeviceError:
-                        run.over.wait(CHECK_S)
+        try:
+            asked_s = now_s(self._clock)
+            plays = self._flag("isStreaming", ask)
+            ended = self._has_ended(run, asked_s, plays, ask)
+            if run.waits and not (ended or plays) and asked_s > checked_s + CHECK_S:
+                self._check_trigger(RISING, ask)
+                checked_s = asked_s
+        except Exception as error:
+            if not run.over.is_set():
+                advice = "the gate may open at every scan marker, turn the laser off by its key"
+                _log.error("%s: while a program runs: %s; %s", self.name, error, advice)
+                self._lost = True
+                self._try_to_lower()
+            return None
+        return checked_s
+
+    def _try_to_lower(self) -> None:
+        """Take the outputs low, unless the box cannot be reached."""
+        with suppress(DeviceError):
+            self._lower()
 
     def _check_trigger(self, wanted: int, ask: Callable[[str], Any] | None = None) -> None:
         found = (ask or self._rpc.call)("getTriggerStart")
@@ -371,6 +381,20 @@ class PulseStreamer(SyncBoard):
                 f"{self.name}: a dark test of 248 ns {what}; check the clock at its input and 'clock', power-cycle "
                 f"it, or report it with firmware {self._firmware}"
             )
+
+
+def _watch(device: "weakref.ref[PulseStreamer]", run: _Run, clock: Clock) -> None:
+    """Count the sweeps of a program until it is over or the device is deleted, which takes the outputs low."""
+    checked_s: float | None = now_s(clock)
+    while not run.over.wait(CHECK_S if checked_s is None else run.pause_s(now_s(clock))):
+        box = device()
+        if box is None:
+            return
+        if checked_s is None:
+            box._try_to_lower()  # the box goes on by itself, and the network may have come back
+        else:
+            checked_s = box._look(run, checked_s)
+        del box
 
 
 def _replace_program(rpc: JsonRpc) -> None:

@@ -1,6 +1,7 @@
 """Pulse Streamer: its driver on the model's wire, the sequences for programs, and the count of sweeps."""
 
 import base64
+import gc
 import selectors
 import socket
 import struct
@@ -599,6 +600,22 @@ def test_a_box_that_was_out_of_reach_is_taken_low_when_the_network_is_back() -> 
         eventually(lambda: device.port_lost)
         box.server.plug()
         eventually(lambda: not device._armed.is_set())
+        box.trigger.pulse(box.now_s + 1e-3, 1e-3)
+        box.clock.sleep(2e-3)
+        assert box.pins == 0
+
+
+@pytest.mark.parametrize("repeats", [1, 1000])
+def test_a_box_that_is_deleted_while_its_program_waits_is_taken_low(
+    repeats: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pulse_box() as box:
+        device = box.open()
+        device.program(SWEEP, repeats)
+        device.run()
+        del device
+        gc.collect()
+        eventually(lambda: "was left running; its outputs were taken low" in caplog.text)  # its thread may just ask
         box.trigger.pulse(box.now_s + 1e-3, 1e-3)
         box.clock.sleep(2e-3)
         assert box.pins == 0
