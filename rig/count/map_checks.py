@@ -16,10 +16,13 @@ Point and partners each have a line of counts: those of the row in the column.
   than behind them, on lines of counts that did not give the answers; or, in dense fog, where more lines contribute, at
   least 0.4 of the light that the estimator says it has found.
 
+Answers that do not have that much light lose their confidence, and with them all answers at the same distances.
+
 Standard deviations are estimated from the points themselves. With too few points, a check says nothing.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -94,6 +97,21 @@ class Points(NamedTuple):
     moved_px: Array
 
 
+class Unlit(NamedTuple):
+    """Sure answers at equal distances, of which not even LEAST_SHARE of the claimed light was found.
+
+    near_px, far_px: smallest and largest distance, from the first searched pixel of the row on the side of near depths.
+    share: of the light that was found. row, column, x: the answer in the middle of the group.
+    """
+
+    near_px: int
+    far_px: int
+    share: float
+    row: int
+    column: int
+    x: int
+
+
 def check_points(geometry: SweepGeometry, points: int = POINTS) -> Points:
     """Up to `points` points spread evenly over the map; none if no row and column has all its partners."""
     reference = geometry.reference_px()
@@ -133,8 +151,11 @@ class MapChecks:
         self._points: dict[int, Points] = {}
         self._orders = _orders()
 
-    def doubts(self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable) -> tuple[str, ...]:
+    def check(
+        self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable
+    ) -> tuple[tuple[str, ...], StripeTable]:
         """Doubts about a map, at most one: a sentence that says what to look at; empty if nothing speaks against it.
+        Also the stripe table, in which answers without light have at most the share of light found as confidence.
 
         sweep: a `CountVolume`, or a sweep with `checked`: the lines of counts of POINTS points and of their partners,
         (lines, points, window). intensity: (rows, width). stripe: the estimator's answers, unfiltered.
@@ -145,21 +166,23 @@ class MapChecks:
         counts = _Counts(sweep, self._geometry, self._points[most])
         seen = counts.exposures_seen()
         if not seen.any():
-            return ()  # all of its frames were lost, which the gaps show
+            return (), stripe  # all of its frames were lost, which the gaps show
         fired = float(intensity.sum()) / (float(seen.sum()) * self._geometry.rows)
         if fired == 0.0:
-            return ("no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power",)
+            dark = "no light: not one pixel fired in any frame; check lens cap, laser, gate and the sensor's power"
+            return (dark,), stripe
         if fired > SATURATED:
-            return (
+            saturated = (
                 f"saturated: {fired:.1%} of the pixels fired in every frame; shorten the exposure, darken the room, or "
-                "check that ones are photons",
+                "check that ones are photons"
             )
+            return (saturated,), stripe
         usual = np.asarray(intensity / np.maximum(seen, 1), np.float32)
         usual[self._geometry.defects] = np.nan
         wrong = self._of_counts(counts, usual, DIMMEST * fired, stripe)
-        if wrong is None and self._knows:
-            wrong = self._of_answers(counts, stripe)
-        return () if wrong is None else (wrong,)
+        if wrong is None and self._knows and (unlit := self._unlit(counts, stripe)):
+            wrong, stripe = self._without_light(unlit), self._less_sure(stripe, unlit)
+        return (() if wrong is None else (wrong,)), stripe
 
     def _of_counts(
         self, counts: "_Counts", usual: NDArray[np.float32], least: float, stripe: StripeTable
@@ -185,7 +208,7 @@ class MapChecks:
                 )
         rows, columns = out[:, 0], out[:, 1]
         if _deviations(rows) < LIMIT:
-            if self._knows and self._sure(counts, stripe)[0] and self._of_answers(counts, stripe) is None:
+            if self._knows and self._sure(counts, stripe)[0] and not self._unlit(counts, stripe):
                 return None  # too faint for the points alone, but the answers have found it
             return (
                 "no line: no light that one row shares with the next stands out of the noise; check laser, gate, power "
@@ -259,13 +282,14 @@ class MapChecks:
         sure = lit[stripe.confidence[y[lit], c[lit]] >= SURE]
         return min(len(sure) // FEWEST_POINTS, GROUPS), sure
 
-    def _of_answers(self, counts: "_Counts", stripe: StripeTable) -> str | None:
+    def _unlit(self, counts: "_Counts", stripe: StripeTable) -> list[Unlit]:
+        """The groups of sure answers that do not have the light that their confidence claims, near ones first."""
         from rig.count.map_check_kernels import add_contrast
 
         geometry, points = self._geometry, counts.points
         groups, sure = self._sure(counts, stripe)
         if not groups:
-            return None
+            return []
         y, c = points.row[0, sure], points.column[0, sure]
         x = np.rint(stripe.x_px[y, c]).astype(np.int64)
         away = 1 if geometry.near_is_left else -1
@@ -276,24 +300,42 @@ class MapChecks:
                 counts.exposures[partner, sure], x + points.shift[partner - 1, sure], away, LINE_PX, BEHIND_PX,
                 geometry.x0, geometry.x_lo, geometry.x_hi, geometry.width, contrast, asked,
             )  # fmt: skip
-        order = np.argsort(away * (x - geometry.x_lo[y, c]), kind="stable")
+        distance = away * (x - geometry.x_lo[y, c])
+        order, unlit = np.argsort(distance, kind="stable"), []
         for group in np.array_split(order[asked[order] > 0], groups):
             if len(group) >= FEWEST_POINTS // 2:
                 found = _deviations(contrast[group]) / np.sqrt(len(group))
                 light = (LINE_PX[1] - LINE_PX[0] + 1) * contrast[group].sum()
                 claimed = float((asked[group] * stripe.signal[y[group], c[group]]).sum())
                 if found + 1.0 / np.sqrt(len(group)) < LEAST_CONTRAST and light < LEAST_SHARE * claimed:
-                    middle = group[len(group) // 2]
-                    row, px = y[middle], min(max(x[middle], 0), geometry.width - 1)
-                    ray = geometry.u[row, px], geometry.v[row, px], 1.0
-                    depth_m = float(1.0 / (geometry.plane[c[middle]] @ ray))
-                    where = f" at about {depth_m:.1f} m" if self._calibrated else ""
-                    return (
-                        f"answers without light: those of confidence {SURE:g} and more{where} "
-                        "hardly have more light than what is behind them; haze or halo may be learned wrong: compare "
-                        "with the other of likelihood and joint, other exposures, or a shorter depth range"
+                    middle, ends = group[len(group) // 2], distance[group[[0, -1]]]
+                    share = min(max(light / claimed, 0.0), LEAST_SHARE)
+                    unlit.append(
+                        Unlit(int(ends[0]), int(ends[1]), share, int(y[middle]), int(c[middle]), int(x[middle]))
                     )
-        return None
+        return unlit
+
+    def _without_light(self, unlit: list[Unlit]) -> str:
+        """The doubt about answers without light, at the first of these groups."""
+        _, _, _, row, column, x = unlit[0]
+        geometry = self._geometry
+        px = min(max(x, 0), geometry.width - 1)
+        depth_m = float(1.0 / (geometry.plane[column] @ (geometry.u[row, px], geometry.v[row, px], 1.0)))
+        where = f" at about {depth_m:.1f} m" if self._calibrated else ""
+        return (
+            f"answers without light: those of confidence {SURE:g} and more{where} "
+            "hardly have more light than what is behind them; haze or halo may be learned wrong: compare "
+            "with the other of likelihood and joint, other exposures, or a shorter depth range"
+        )
+
+    def _less_sure(self, stripe: StripeTable, unlit: list[Unlit]) -> StripeTable:
+        """The table with the confidence of all answers at the distances of these groups lowered to their shares."""
+        geometry, confidence = self._geometry, stripe.confidence.copy()
+        distance = (1 if geometry.near_is_left else -1) * (np.rint(stripe.x_px) - geometry.x_lo)
+        for group in unlit:
+            there = (distance >= group.near_px) & (distance <= group.far_px)
+            confidence[there] = np.minimum(confidence[there], np.float32(group.share))
+        return replace(stripe, confidence=confidence)
 
 
 class _Counts:

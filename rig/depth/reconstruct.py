@@ -187,7 +187,7 @@ class Reconstructor:
         """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread."""
         begun = time.perf_counter() - estimate_s
         geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe, used), sweep.intensity(workers)
-        doubts = self._checks.doubts(sweep, intensity, stripe)
+        doubts, stripe = self._checks.check(sweep, intensity, stripe)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)
         if filter == "median":

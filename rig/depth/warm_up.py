@@ -44,7 +44,7 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         counter.add(frames, bins, bins.astype(np.float64), np.zeros(len(bins), np.int32))
         sweep = counter.finish()
         stripe = maker.estimate(sweep, geometry)
-        checks.doubts(sweep, sweep.intensity(), stripe)
+        checks.check(sweep, sweep.intensity(), stripe)
         if maker.used is not None:
             read_fog(sweep, stripe, geometry, maker.used)
     if estimator in COUPLED and isinstance(maker.used, RowModel) and isinstance(sweep, CountVolume):

@@ -90,7 +90,7 @@ def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, 
             points = check_points(maker.geometry)
             kept = SimpleNamespace(n_frames=volume.n_frames, checked=volume.counts[points.column, points.row])
             checks = MapChecks(maker.geometry, calibrated=True, knows=estimator in LEARNING)
-            doubts[fault] = checks.doubts(kept, volume.intensity(), result.stripe)
+            doubts[fault], _ = checks.check(kept, volume.intensity(), result.stripe)
         if change is None:
             sure = result.stripe.confidence >= SURE
             error = np.abs(result.stripe.x_px - point.truth())

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rig.count import map_check_kernels, map_checks
-from rig.count.map_checks import MapChecks
+from rig.count.map_checks import LEAST_SHARE, MapChecks
 from rig.geometry.stripe_table import StripeTable
 from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated, volume_of
@@ -27,7 +27,7 @@ def doubts(light: str, exposures: int, change: Change | None = None, rig: str = 
     counts = sweep.counts if change is None else change(sweep.counts, exposures, np.random.default_rng(0))
     volume = volume_of(counts, sweep.geometry, exposures)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=False)
-    return checks.doubts(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS))
+    return checks.check(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS))[0]
 
 
 def least_significant_first(counts: Counts, *_: Any) -> Counts:
@@ -110,31 +110,38 @@ def test_sure_answers_need_light() -> None:
     nothing = np.zeros_like(truth)
     sure, light = np.where(np.isfinite(truth), np.float32(0.95), np.float32(0.0)), np.full_like(truth, 0.5)
     right = StripeTable(truth, sure, nothing, light, nothing)
-    assert checks.doubts(volume, volume.intensity(), right) == ()
+    assert checks.check(volume, volume.intensity(), right) == ((), right)
     # A surface that is not there, in the haze before some of the stripes.
     beside = replace(right, x_px=np.where(np.arange(COLUMNS) % 4 == 0, truth - 25, truth).astype(np.float32))
-    (reason,) = checks.doubts(volume, volume.intensity(), beside)
+    (reason,), lowered = checks.check(volume, volume.intensity(), beside)
     assert reason.startswith("answers without light")
+    # Half of the false answers are at distances where hardly any others are.
+    false = np.isfinite(truth) & (np.arange(COLUMNS) % 4 == 0)
+    assert (lowered.confidence <= beside.confidence).all()
+    less = lowered.confidence < beside.confidence
+    assert (lowered.confidence[less] <= LEAST_SHARE).all()
+    assert less[false].mean() > 0.4
+    assert less[np.isfinite(truth) & ~false].mean() < 0.1
     pole = replace(right, x_px=np.where(np.arange(COLUMNS) % 10 == 0, truth - 60, truth).astype(np.float32))
-    (reason,) = checks.doubts(volume, volume.intensity(), pole)
+    (reason,), _ = checks.check(volume, volume.intensity(), pole)
     assert reason.startswith("answers without light"), "a tenth of the answers is wrong"
     # Little light, but all that was said to be there: in dense fog many lines of counts share in an answer.
     dim = replace(beside, signal=np.full_like(truth, 0.02))
-    assert checks.doubts(volume, volume.intensity(), dim) == ()
+    assert checks.check(volume, volume.intensity(), dim) == ((), dim)
     # An estimator that says it is not sure has claimed nothing.
     unsure = replace(beside, confidence=np.full_like(truth, 0.5))
-    assert checks.doubts(volume, volume.intensity(), unsure) == ()
+    assert checks.check(volume, volume.intensity(), unsure) == ((), unsure)
 
 
 def test_a_map_of_few_points_is_not_judged() -> None:
     sweep = simulated("report", 10, rows=4, columns=30)
     volume = volume_of(noise(sweep.counts, 10, np.random.default_rng(0)), sweep.geometry, 10)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=True)
-    assert checks.doubts(volume, volume.intensity(), StripeTable.empty(4, 30)) == ()
+    assert checks.check(volume, volume.intensity(), StripeTable.empty(4, 30))[0] == ()
 
 
 def test_a_map_whose_frames_were_all_lost_is_not_called_dark() -> None:
     sweep = simulated("clear", 3, "left", rows=ROWS, columns=COLUMNS)
     volume = volume_of(np.zeros_like(sweep.counts), sweep.geometry, 0)
     checks = MapChecks(sweep.geometry, calibrated=True, knows=False)
-    assert checks.doubts(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS)) == ()
+    assert checks.check(volume, volume.intensity(), StripeTable.empty(ROWS, COLUMNS))[0] == ()
