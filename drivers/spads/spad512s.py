@@ -12,7 +12,7 @@ Facts and their sources: docs/reference/devices/spad512s.md. `spad512s_line` tal
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 - Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
   either. Pixels handed over twice would have the right length, so a frame identical to an earlier one of the run is an
-  error, unless all its pixels are equal.
+  error, unless chance can do that: dark frames often differ in nothing (`OWN_ONES`).
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 
@@ -48,6 +48,12 @@ SLICE_S = 0.05
 _ERROR_CHECK_S = 0.5
 """Silence within a run after which the last bytes are looked at: they may be an error text."""
 _UNIFORM = (0x00, 0xFF)
+OWN_ONES = 100
+"""A frame is repeated by the device, and not by chance, if at least so many of its ones are missing in another frame of
+the run. That frame lacks a one with probability 1 - p if its pixel fires with probability p, and less if more light
+fell on it. So it lacks L = sum(1 - p) ones on average, and chance repeats all of them with probability prod(p), below
+exp(-L). 100 missing ones mean L > 50; a run of 10 000 frames has 5e7 pairs of frames, so chance repeats one of them in
+1e-14 of such runs. Pixels that always fire count for nothing."""
 
 
 class Spad512sRun:
@@ -71,6 +77,8 @@ class Spad512sRun:
         self._heard_at = time.monotonic()
         self._seen: dict[tuple[int, int], int] = {}
         """Numbers of the frames seen, by checksums of their halves; 32 bits alone are too few for 10 000 frames."""
+        self._new: list[tuple[int, NDArray[np.uint8]]] = []
+        """The two latest frames that repeated none, with their numbers."""
 
     @property
     def next_n(self) -> int:
@@ -144,15 +152,22 @@ class Spad512sRun:
         )
 
     def _require_new(self, frames: NDArray[np.uint8]) -> None:
-        """Raise ProtocolError for a frame that came before, unless it is all dark or all bright. frames: uint8 (n, 2,
-        bytes of half a frame)."""
-        for number, (one, other) in enumerate(frames, self.next_frame):
+        """Raise ProtocolError for a frame that came before, unless it is all dark or all bright or chance may have
+        repeated it (`OWN_ONES`). frames: uint8 (n, 2, bytes of half a frame)."""
+        for number, frame in enumerate(frames, self.next_frame):
+            one, other = frame
             before = self._seen.setdefault((zlib.crc32(one), zlib.crc32(other)), number)
-            if before != number and not (one[0] in _UNIFORM and (one == one[0]).all() and (other == one[0]).all()):
-                raise ProtocolError(
-                    f"{self._name}: frame {number} is the very same as frame {before}: pixels were handed over twice, "
-                    "or the sensor is saturated; start again, with less light"
-                )
+            new = [(its, seen) for its, seen in self._new if its != before]
+            if before == number:
+                self._new = [*new[-1:], (number, frame)]
+            elif not (one[0] in _UNIFORM and (frame == one[0]).all()):
+                own = frame & ~new[-1][1] if new else frame
+                if np.unpackbits(own).sum() >= OWN_ONES:
+                    raise ProtocolError(
+                        f"{self._name}: frame {number} is the very same as frame {before}: pixels were handed over "
+                        "twice, or the sensor is saturated; start again, with less light"
+                    )
+        self._new = [(number, frame.copy()) for number, frame in self._new]  # the block's memory is used again
 
     def _refuse_error_text(self, rest: bytes) -> None:
         """Raise DeviceFault with the device's own words if what came last is text that ends with ERROR."""

@@ -28,7 +28,7 @@ from drivers.errors import (
 from drivers.frames import BlockFlag, FrameBlock
 from drivers.interfaces import SpadRequest
 from drivers.ring import OnFull
-from drivers.spads.spad512s import Spad512s, Spad512sConfig
+from drivers.spads.spad512s import OWN_ONES, Spad512s, Spad512sConfig
 from drivers.spads.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import CONTROL_FILE, IN, OUT, Tap, TapFile, read_taps
@@ -214,6 +214,53 @@ def test_trap_frames_without_numbers_may_come_twice_in_place_of_others() -> None
     for uniform in (dark, ~dark):
         with connected(Spad512sModel(lambda first, start_s, period_s, n: uniform[:n])) as (device, _):  # noqa: B023
             assert len(take(device, 48)) == 3
+
+
+def stuck_pixels(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    frames = np.zeros((n, 512, 64), np.uint8)
+    frames[:, 100, 5] = 0x10
+    return frames
+
+
+def broken_row(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    """A row that always fires, and a dark count somewhere else in every fourth frame."""
+    frames = np.zeros((n, 512, 64), np.uint8)
+    frames[:, 7] = 0xFF
+    for index in range(n):
+        if (first + index) % 4 == 0:
+            frames[index, 9 + (first + index) // 4, 3] = 1
+    return frames
+
+
+def screaming_pixels(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+    """200 pixels that nearly always fire, under a light that is on in every other frame."""
+    frames = np.zeros((n, 512, 64), np.uint8)
+    for index in range(n):
+        draw = np.random.default_rng(first + index)
+        frames[index, :200, 7] = draw.random(200) < 0.999
+        if (first + index) % 2:
+            frames[index, 200:] = draw.integers(0, 256, (312, 64))
+    return frames
+
+
+@pytest.mark.parametrize("dark", [stuck_pixels, broken_row, screaming_pixels])
+def test_dark_frames_that_differ_in_nothing_are_sound(dark: Any) -> None:
+    with connected(Spad512sModel(dark)) as (device, _):
+        got = device.grab(100, exposure_s=1e-6)
+    assert got.number.size == 100
+    assert np.unique(got.bits, axis=0).shape[0] < 100, "some came twice"
+
+
+@pytest.mark.parametrize("ones", [2 * OWN_ONES, 100_000])
+@pytest.mark.parametrize("stuck_from", [1, 2, 21])
+def test_a_camera_that_sends_one_frame_again_and_again_is_found(ones: int, stuck_from: int) -> None:
+    def stuck(first: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
+        draws = (np.random.default_rng(min(number, stuck_from - 1)) for number in range(first, first + n))
+        return np.stack([np.packbits(draw.random((512, 512)) < ones / 512**2, axis=1) for draw in draws])
+
+    found = rf"frame {stuck_from} is the very same as frame {stuck_from - 1}"
+    with connected(Spad512sModel(stuck)) as (device, _), pytest.raises(ProtocolError, match=found):
+        device.grab(50)
 
 
 def test_trap_done_glued_to_answers_commands_never_pipelined_and_pile_up_before_every_run() -> None:
