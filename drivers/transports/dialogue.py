@@ -14,9 +14,11 @@ fastest, and if nothing at all comes within `AGAIN_S`, the device is silent. Com
 usual time, since a firmware may be slow to store it.
 """
 
+import logging
 import re
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -24,22 +26,55 @@ from drivers.clock import Clock, now_s
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, DeviceTimeout, ProtocolError
 from drivers.transports.serial_port import SerialPort
 
+_log = logging.getLogger(__name__)
 
-class FairLock:
-    """A lock for `with`, not re-entrant. A waiting thread gets the lock before the thread that had it last."""
+
+LEFT_HELD_S = 10.0
+"""Time after which a `FairLock` is taken from another thread. A device that is silent holds it for half as long."""
+
+
+class _Mutex:
+    """A lock that its own thread may take again, and another one after `LEFT_HELD_S`."""
 
     def __init__(self) -> None:
-        self._turn = threading.Lock()
-        self._held = threading.Lock()
+        self._lock = threading.RLock()
+
+    def take(self) -> None:
+        """Wait for the lock and hold it."""
+        if not self._lock.acquire(timeout=LEFT_HELD_S):
+            _log.error("a thread has not ended its exchange with a device for %g s; not waiting", LEFT_HELD_S)
+            self._lock = threading.RLock()
+            self._lock.acquire()
+
+    def give(self) -> None:
+        """Release the lock, however often it was taken."""
+        with suppress(RuntimeError):  # not held by this thread any more
+            while True:
+                self._lock.release()
+
+
+class FairLock:
+    """A lock for `with`, not re-entrant. A waiting thread gets the lock before the thread that had it last.
+
+    An interrupt just as the lock is taken or released may leave it held. The thread that was interrupted then has it
+    when it next enters; any other takes it after `LEFT_HELD_S`. So nobody who wants the light off waits for ever.
+    """
+
+    def __init__(self) -> None:
+        self._turn = _Mutex()
+        self._held = _Mutex()
 
     def __enter__(self) -> None:
         """Wait for the turn, then for the lock."""
-        with self._turn:
-            self._held.acquire()
+        try:
+            self._turn.take()
+            self._held.take()
+        finally:
+            self._turn.give()
 
     def __exit__(self, *_: object) -> None:
         """Release the lock. A waiting thread gets it."""
-        self._held.release()
+        self._held.give()
 
 
 DONE = "OK"
@@ -165,7 +200,10 @@ class Dialogue:
         with self._lock:
             reply, self._silent = "", False
             for attempt in range(_ATTEMPTS):
-                if attempt or (self._unread and self._framing.asks(command)):
+                if attempt or self._unread:
+                    if not (attempt or self._framing.asks(command)):
+                        self._write(command)  # at once, as it may switch the light off; then again, for its reply
+                        self._quiet_since_s = now_s(self.clock)
                     self._resync(self._timing.quiet_s)
                 try:
                     reply = self._once(command)

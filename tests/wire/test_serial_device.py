@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 
 from drivers.clock import Clock, now_s
-from drivers.errors import DeviceDisconnected, DeviceTimeout, WrongState
+from drivers.errors import CommandRefused, DeviceDisconnected, DeviceTimeout, WrongState
 from drivers.registry import kinds, lookup
 from drivers.transports.serial_device import SerialDevice
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
+from tests.wire.faults import Fault, FaultScript
 from tests.wire.lasers import PATIENCE_S, eventually, open_cobolt, open_ibeam, open_obis, wire
 from tests.wire.syncs import board, teensy
 
@@ -65,6 +66,21 @@ def test_nobody_waits_for_the_reply_to_a_command_that_is_sent_and_none_takes_it_
             device.send(command)
     with pytest.raises(WrongState):
         device.send(command)
+
+
+def test_a_late_reply_to_what_was_sent_is_not_taken_for_that_of_the_next_set_command() -> None:
+    faults, model = FaultScript(), CoboltModel("06-01")
+    with wire(model, faults=faults) as (_, surroundings), open_cobolt(surroundings) as laser:
+        line = laser._line  # type: ignore[attr-defined]
+        faults._script = [Fault.LATE]
+        laser.send("?")  # type: ignore[attr-defined]
+        with pytest.raises(CommandRefused):
+            line.tell("nonsense")
+        laser.send("?")  # type: ignore[attr-defined]
+        model.commands.clear()
+        line.tell("las:paus 1")
+        assert model.commands[0] == "las:paus 1", "what may end the light is said at once"
+        assert model.commands[-1] == "las:paus 1"
 
 
 def test_trap_a_command_of_a_cobolt_that_has_no_reply_is_sent_and_not_asked() -> None:

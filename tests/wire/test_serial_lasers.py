@@ -2,8 +2,9 @@
 
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from types import FrameType
@@ -24,7 +25,8 @@ from drivers.lasers.ibeam import IbeamConfig
 from drivers.lasers.obis import ObisConfig
 from drivers.lasers.serial_laser import EMULATED_SILENCE_S, SerialLaser, SerialLaserConfig
 from drivers.registry import Surroundings, kinds, lookup
-from drivers.transports.dialogue import HELD_UP_S, FairLock
+from drivers.transports import dialogue
+from drivers.transports.dialogue import HELD_UP_S, LEFT_HELD_S, FairLock
 from drivers.transports.serial_port import AGAIN_S
 from rig.config.files import load_config
 from rig.devices import open as session
@@ -36,7 +38,18 @@ from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.wire.faults import Fault, FaultScript
-from tests.wire.lasers import USUAL, Babble, Silent, bring_up, eventually, open_cobolt, open_ibeam, open_obis, wire
+from tests.wire.lasers import (
+    PATIENCE_S,
+    USUAL,
+    Babble,
+    Silent,
+    bring_up,
+    eventually,
+    open_cobolt,
+    open_ibeam,
+    open_obis,
+    wire,
+)
 from tests.wire.serial_wire import STANDSTILL_S, hold_up
 
 
@@ -225,6 +238,12 @@ def test_a_firmware_that_hangs_is_a_timeout_within_its_deadline(make: Make) -> N
 def test_the_line_goes_to_who_waits_before_who_had_it_last() -> None:
     lock, order = FairLock(), []
 
+    def taken() -> bool:
+        if lock._turn._lock.acquire(blocking=False):
+            lock._turn._lock.release()
+            return False
+        return True
+
     def wait() -> None:
         with lock:
             order.append("who waited")
@@ -232,7 +251,7 @@ def test_the_line_goes_to_who_waits_before_who_had_it_last() -> None:
     thread = threading.Thread(target=wait)
     with lock:
         thread.start()
-        eventually(lock._turn.locked)
+        eventually(taken)
     with lock:
         order.append("who had it")
     thread.join()
@@ -258,6 +277,41 @@ class Strike:
                 sys.settrace(None)
                 raise KeyboardInterrupt
         return self
+
+
+def test_an_interrupt_at_any_line_of_an_exchange_keeps_nobody_from_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the thread that was interrupted nor, after a time, another one."""
+    monkeypatch.setattr(dialogue, "LEFT_HELD_S", 0.3)
+    at, struck = 0, True
+    with wire(ObisModel(cdrh_delay_s=0.0)) as (_, surroundings), open_obis(surroundings) as laser:
+        while struck:
+            at += 1
+            strike, before = Strike(dialogue, at), sys.gettrace()
+            sys.settrace(strike)
+            with suppress(KeyboardInterrupt):
+                laser.ask("SYST:LOCK?")
+            sys.settrace(before)
+            struck = strike.left <= 0
+            if at % 2:
+                other = threading.Thread(target=laser.pause, daemon=True)
+                other.start()
+                other.join(PATIENCE_S)
+                assert not other.is_alive(), at
+            laser.pause()
+    assert at > 20
+
+
+def test_the_thread_that_was_interrupted_has_the_line_at_once() -> None:
+    lock = FairLock()
+    lock.__enter__()  # and an interrupt before the block
+    began_s = time.monotonic()
+    with lock:
+        pass
+    assert time.monotonic() - began_s < LEFT_HELD_S
+    other = threading.Thread(target=lock.__enter__, daemon=True)
+    other.start()
+    other.join(LEFT_HELD_S)
+    assert not other.is_alive(), "it is free for others afterwards"
 
 
 @each_dialect
