@@ -15,7 +15,7 @@ by `las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 0
 constant current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what
 the next program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as
 dark, `pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must
-then be turned off and on before the laser starts again.
+then be turned off and on before the laser starts again. With autostart disabled it need not, so `close` sends `l0` too.
 """
 
 import logging
@@ -420,6 +420,11 @@ class CoboltLaser(SerialLaser):
             # The mode has no set power, or the laser did not accept it: only off is surely dark.
             self._switch_off()
             _log.warning("%s: switched off, its key must be turned before it starts again", self._name)
+
+    def _make_safe(self) -> None:
+        super()._make_safe()
+        if self._autostart is False:  # then it starts again without its key, and need not stay on and dark
+            self._switch_off()
 
     def _do_disarm(self) -> None:
         try:

@@ -90,6 +90,11 @@ class IbeamFraming:
                 "ibeam laser: its replies come one command late; it was told to switch off. Power-cycle it"
             )
 
+    def undo(self, port: SerialPort) -> None:
+        """Put echo and prompt back."""
+        for command in self.changed:
+            _say(port, command)
+
     def greets(self, reply: str) -> bool:
         """Whether the reply tells a serial number."""
         return SERIAL.fullmatch(reply) is not None
@@ -303,7 +308,9 @@ def create(config: IbeamConfig, surroundings: Surroundings, timing: LineTiming =
     """Open the laser and identify it; changes nothing about it but echo, prompt and talk."""
     framing = IbeamFraming()
     identify = partial(_identify, config, framing)
-    return open_laser("ibeam", config, surroundings, framing, timing, identify, _off(config), framing.prepare)
+    return open_laser(
+        "ibeam", config, surroundings, framing, timing, identify, _off(config), framing.prepare, framing.undo
+    )
 
 
 def _identify(config: IbeamConfig, framing: IbeamFraming, line: Dialogue) -> IbeamLaser:

@@ -213,11 +213,13 @@ def open_laser(
     identify: Callable[[Dialogue], _Laser],
     off: bytes,
     prepare: Callable[[SerialPort], None] | None = None,
+    undo: Callable[[SerialPort], None] | None = None,
 ) -> _Laser:
     """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
 
     make: name of the make in messages. off: bytes that switch the laser off in any state. prepare: called with the
-    open port first, for a laser whose replies may have another form than `framing` reads. identify: makes the laser.
+    open port first, for a laser whose replies may have another form than `framing` reads. undo: puts back what
+    `prepare` has changed; called if opening fails. identify: makes the laser.
     Raises `DeviceNotFound` if nothing of that make answers, and what `SerialPort`, `prepare` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
@@ -236,6 +238,9 @@ def open_laser(
         laser.watch_for_end(off)
         return laser
     except BaseException:
+        if undo is not None:
+            with suppress(DeviceError):  # the first error is the one to report
+                undo(port)
         port.close()
         raise
 

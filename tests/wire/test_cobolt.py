@@ -171,6 +171,19 @@ def test_trap_units_that_refuse_the_questions_for_key_and_autostart_are_asked_ot
             assert model.commands.count("@cobasks?") == (2 if autostart else 0)  # refused twice, not asked any more
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("autostart", [True, False])
+def test_a_close_switches_off_where_no_key_must_be_turned_afterwards(family: Family, autostart: bool) -> None:
+    model = CoboltModel(family, autostart=autostart)
+    with wire(model) as (_, surroundings):
+        for _ in range(2):
+            with open_cobolt(surroundings) as laser:
+                bring_up(laser, surroundings.clock)
+                assert model.on
+            assert not model.emitting
+            assert model.on == autostart
+
+
 @pytest.mark.parametrize("autostart", [True, False])
 def test_a_unit_that_says_nothing_of_key_and_autostart_can_be_started(autostart: bool) -> None:
     refused = {"@cobas?", "@cobasks?", "gas?"} | (set() if autostart else {"@cob1"})

@@ -94,6 +94,10 @@ def test_echo_and_prompt_are_put_off_and_back(echo: bool, prompt: bool) -> None:
         assert (model.echo, model.prompt) == (False, False)
         device.arm(0.05)
     assert (model.echo, model.prompt) == (echo, prompt)
+    model = IbeamModel(echo=echo, prompt=prompt)
+    with wire(model) as (_, surroundings), pytest.raises(DeviceNotFound, match="not 999"):
+        open_ibeam(surroundings, serial_number="999")
+    assert (model.echo, model.prompt) == (echo, prompt), "also if it cannot be opened"
     assert not model.state_on
 
 
