@@ -34,7 +34,8 @@ LATE_CALLS = 5
 """After a call that was not answered, no program is started for so many times the deadline: heard late, the call could
 stop the program in its midst, with the gate high."""
 RETRY_S = 0.3
-"""Time for which a refused connection, or one closed without a word, is tried again: the box may serve others."""
+"""Time for which a connection that fails, or one closed without a word, is tried again: the box may serve others. A
+question with a deadline of its own is tried again until then."""
 _QUESTIONS = ("get", "has", "is")
 _REPEATABLE = ("constant", *_QUESTIONS)
 """Beginnings of methods that may be called again if the box may have heard them already. A second `stream` could stop a
@@ -112,7 +113,7 @@ class JsonRpc:
         """
         body = json.dumps({"jsonrpc": "2.0", "id": next(self._numbers), "method": method, "params": params}).encode()
         self._note(OUT, body)
-        text = self._exchange(method, body, within_s or self.call_s)
+        text = self._exchange(method, body, within_s or self.call_s, within_s or RETRY_S)
         self._note(IN, text)
         try:
             answer = parse_json(text)
@@ -130,8 +131,9 @@ class JsonRpc:
             )
         return answer["result"]
 
-    def _exchange(self, method: str, body: bytes, within_s: float) -> bytes:
-        """Send a question; returns the answer as far as it came, or the error's text if it is no HTTP."""
+    def _exchange(self, method: str, body: bytes, within_s: float, retry_s: float) -> bytes:
+        """Send a question; returns the answer as far as it came, or the error's text if it is no HTTP. retry_s: time
+        for which a connection that fails is tried again."""
         head = (
             f"POST /json-rpc HTTP/1.1\r\nHost: {self._peer[0]}:{self._peer[1]}\r\nConnection: close\r\n"
             f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
@@ -157,9 +159,10 @@ class JsonRpc:
                     f"{self._name}: no connection {where}; check its power, its cable and 'port'"
                 ) from None
             except OSError as error:
-                again = isinstance(error, ConnectionError) and (not reached or method.startswith(_REPEATABLE))
+                # Before the connection stands, any error may pass: also that there is no route to the box.
+                again = not reached or (isinstance(error, ConnectionError) and method.startswith(_REPEATABLE))
                 patience.left_s -= _RETRY_PAUSE_S
-                if not again or patience.left_s < max(within_s - RETRY_S, 0):
+                if not again or patience.left_s < max(within_s - retry_s, 0):
                     raise DeviceDisconnected(
                         f"{self._name} cannot be reached at {self._address} ({one_line(error)}); check its power, its "
                         "cable and 'port'"

@@ -1,6 +1,7 @@
 """Pulse Streamer: its driver on the model's wire, the sequences for programs, and the count of sweeps."""
 
 import base64
+import errno
 import gc
 import selectors
 import socket
@@ -321,7 +322,7 @@ def test_a_box_that_does_not_answer_is_closed_within_a_second_without_an_error(
 ) -> None:
     waits_s: list[float] = []
 
-    def silent(method: str, body: bytes, within_s: float) -> bytes:
+    def silent(method: str, body: bytes, within_s: float, retry_s: float) -> bytes:
         if threading.current_thread() is threading.main_thread():
             waits_s.append(within_s)
         raise DeviceTimeout("no answer")
@@ -436,6 +437,18 @@ def test_a_question_is_asked_twice_within_the_silence_of_a_box_and_then_the_box_
         assert passed.now_s == pytest.approx(0.3, abs=0.021)
         for _ in range(connections):
             listener.accept()[0].close()
+
+
+@pytest.mark.parametrize("trouble", [errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ECONNREFUSED])
+@pytest.mark.parametrize("silence_s", [0.3, 4.0])
+def test_a_box_without_a_route_is_lost_only_after_its_silence(
+    trouble: int, silence_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pulsestreamer_rpc, "time", passed := WaitedTime())
+    monkeypatch.setattr(socket.socket, "connect_ex", lambda *_: trouble)
+    with pytest.raises(DeviceDisconnected, match="cannot be reached"):
+        JsonRpc("box", "127.0.0.1").ask("isStreaming", silence_s)
+    assert passed.now_s == pytest.approx(silence_s, abs=0.021)
 
 
 def test_a_computer_that_is_late_does_not_take_the_box_for_silent(monkeypatch: pytest.MonkeyPatch) -> None:
