@@ -1,8 +1,8 @@
 """Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row. The medium is learned.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
-how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.search.online_learning`; the
-confidence of an answer, from its neighbours: `rig.estimate.search.confidence`. The first map is counted completely and
+how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.online_learning`; the
+confidence of an answer, from its neighbours: `rig.estimate.row.confidence`. The first map is counted completely and
 estimated twice, because pixels that the first estimate shows to lie behind the stripe tell the ambient light. Every
 later map is estimated with a model learned from earlier maps alone: column by column while its frames come in, or when
 it is complete if its columns have more than BYTE_EXPOSURES exposures.
@@ -11,10 +11,10 @@ it is complete if its columns have more than BYTE_EXPOSURES exposures.
 import numpy as np
 
 from rig.count.volume import BYTE_EXPOSURES, Counter, CountVolume, SweepCounter, SweepLayout
+from rig.estimate.online_learning import LearningSetting, LessonInput, OnlineLearner, first_model
+from rig.estimate.row.confidence import believed
 from rig.estimate.row.em import lines_of, next_lattice
 from rig.estimate.row.model import RowModel, line_profile
-from rig.estimate.search.confidence import believed
-from rig.estimate.search.online_learning import LearningSetting, LessonInput, OnlineLearner, first_model
 from rig.estimate.search.prepare import judge_of, signal_reach
 from rig.estimate.search.rows import SearchTables
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep, search_volume

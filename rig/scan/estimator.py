@@ -78,8 +78,8 @@ def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tu
     The text is also empty without a file, and for other estimators. Raises UsageError if the file is not readable, or
     its folder does not exist.
     """
+    from rig.estimate.online_learning import LearningSetting
     from rig.estimate.row.em import path_bins
-    from rig.estimate.search.online_learning import LearningSetting
 
     if file is None or estimator != "joint":
         return None, ""

@@ -15,8 +15,8 @@ from typing import Any
 from numba.core.dispatcher import Dispatcher
 
 from rig import api
+from rig.estimate import online_learning as lessons
 from rig.estimate.registry import ESTIMATORS, LEARNING
-from rig.estimate.search import online_learning as lessons
 from rig.scan.acquisition import Acquisition
 from tests.system.small_rig import config, write_rig
 

@@ -37,6 +37,7 @@ from rig.count.volume import Counts, CountVolume
 from rig.estimate.joint.place.light import FRACTIONS
 from rig.estimate.joint.place.places import BLIND_FLUX, REACH_PX, Places
 from rig.estimate.joint.tables import JointTables
+from rig.estimate.online_learning import LearningSetting
 from rig.estimate.row.em import AGAIN_LINES, PIECES, lines_of
 from rig.estimate.row.inputs import (
     Lines,
@@ -51,7 +52,6 @@ from rig.estimate.row.inputs import (
 )
 from rig.estimate.row.model import BINS, HALO_NODES, HALO_REACHES_PX, RowModel, fit_haze
 from rig.estimate.row.neighbours import SAME_PX
-from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, evenly_spread
 from rig.simd import Bools, Float32, Float64, Int32

@@ -23,11 +23,11 @@ from rig.estimate.joint.place.place import amplitudes_of, line_width, weigh_ligh
 from rig.estimate.joint.solver import MapSolver
 from rig.estimate.joint.tables import MOST_BYTES, JointTables, bytes_of, grid_of, tables_of
 from rig.estimate.joint.temporal import TemporalPrior
+from rig.estimate.online_learning import LearningSetting, OnlineLearner, first_model
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import expect, learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import state_of
 from rig.estimate.row.model import RowModel
-from rig.estimate.search.online_learning import LearningSetting, OnlineLearner, first_model
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32

@@ -24,8 +24,8 @@ from rig.estimate.joint.tables import JointTables
 from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.joint.vote import NEIGHBOURS_PX, Ballots, collect, new_ballots, vote
 from rig.estimate.joint.winner import LabelAnswers, new_answer, new_readout
+from rig.estimate.online_learning import LessonInput
 from rig.estimate.row.em import lines_of, next_lattice
-from rig.estimate.search.online_learning import LessonInput
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32, Float64, Uint8

@@ -12,8 +12,8 @@ from rig.estimate.joint.labels.grid import LabelGrid, label_grid
 from rig.estimate.joint.place.place import profile_table
 from rig.estimate.joint.second_returns import SecondLight, second_light
 from rig.estimate.joint.winner import AnswerSettings, answer_settings
+from rig.estimate.online_learning import LearningSetting
 from rig.estimate.row.inputs import RowState, Sweep, halo_shares, state_of, sweep_of
-from rig.estimate.search.online_learning import LearningSetting
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float32
 from rig.threads import RowWorkers

@@ -11,7 +11,7 @@ import pytest
 from rig.config.models import EstimateConfig
 from rig.depth.maps_at_once import MapsAtOnce
 from rig.depth.reconstruct import Reconstructor
-from rig.estimate.search import online_learning
+from rig.estimate import online_learning
 from tests.unit.small_maps import simulated
 
 SWEPT = [simulated(exposures=3, rows=24, columns=64, seed=seed) for seed in range(1, 8)]

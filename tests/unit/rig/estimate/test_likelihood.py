@@ -3,8 +3,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from rig.estimate import online_learning as lessons
 from rig.estimate.likelihood import Likelihood
-from rig.estimate.search import online_learning as lessons
 from tests.reference.tables.answers import calibration_error
 from tests.unit.small_maps import assert_same, simulated, volume_of
 

@@ -19,11 +19,11 @@ from rig.estimate.joint.lesson import add_quiet
 from rig.estimate.joint.place.place import new_places, profile_table, weigh_light
 from rig.estimate.joint.place.places import most_shown
 from rig.estimate.joint.tables import tables_of
+from rig.estimate.online_learning import LearningSetting
 from rig.estimate.row import inputs
 from rig.estimate.row.inputs import halo_shares, row_buffers, row_fluxes, state_of, sweep_of
 from rig.estimate.row.likelihood import FLOOR
 from rig.estimate.row.model import BINS, HALO_NODES, RowModel, pixel_shares
-from rig.estimate.search.online_learning import LearningSetting
 from rig.simd.memory import pointers
 from rig.simd.vectors import LANES
 from rig.threads import RowWorkers

@@ -8,9 +8,9 @@ import pytest
 
 from rig.count.volume import BIN_DARK, BIN_UNUSABLE, BYTE_EXPOSURES, CountVolume, SweepCounter, SweepLayout
 from rig.estimate import likelihood
+from rig.estimate import online_learning as lessons
 from rig.estimate.likelihood import Likelihood
 from rig.estimate.row.model import RowModel
-from rig.estimate.search import online_learning as lessons
 from rig.estimate.search.stream import ColumnJudge, SearchedSweep
 from rig.geometry.windows import uncalibrated_geometry
 from rig.threads import RowWorkers

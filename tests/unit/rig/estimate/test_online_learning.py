@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from rig.errors import UsageError
+from rig.estimate import online_learning as lessons
 from rig.estimate.joint import tables as joint_tables
 from rig.estimate.joint.joint import Joint
 from rig.estimate.likelihood import Likelihood
-from rig.estimate.search import online_learning as lessons
-from rig.estimate.search.online_learning import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, LearningSetting, OnlineLearner
+from rig.estimate.online_learning import LAG_FRAMES, LEAST_SURE, TEACH_FRAMES, LearningSetting, OnlineLearner
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from rig.estimate.row.confidence import LEAST, MORE_NOISE, REACH, SEEN, SPARED, A, B, C, D, believed, confidences
 from rig.estimate.row.neighbours import on_surface
-from rig.estimate.search.confidence import LEAST, MORE_NOISE, REACH, SEEN, SPARED, A, B, C, D, believed, confidences
 from rig.geometry.stripe_table import StripeTable
 from rig.threads import RowWorkers
 from tests.stability.inventory import covers
