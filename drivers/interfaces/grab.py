@@ -1,5 +1,6 @@
 """Frames of a SPAD array as one array, for a notebook: `SpadArray.grab`."""
 
+import logging
 import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -7,11 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frames import FRAME_RECORD, frame_bytes, packed_row_bytes
+from drivers.errors import DeviceError
+from drivers.frames import FRAME_RECORD, FrameBlock, frame_bytes, packed_row_bytes
 from drivers.ring import BlockRing
 
 if TYPE_CHECKING:
     from drivers.interfaces.spad import SpadArray, SpadTiming
+
+_log = logging.getLogger(__name__)
 
 _RING_BYTES = 256 * 2**20
 _FEWEST_SLOTS, _MOST_SLOTS = 4, 256
@@ -33,6 +37,7 @@ class Grabbed:
     asked: int
     width: int
     timing: "SpadTiming"
+    ended_by: DeviceError | None = None
 
     @property
     def lost(self) -> NDArray[np.int64]:
@@ -54,8 +59,11 @@ class Grabbed:
 
 
 def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: float) -> Grabbed:
-    """Run a configured SPAD once and copy its frames. Raises what `start` and `fill` raise; stops the SPAD anyway."""
-    frames = max(timing.stride // frame_bytes(spad.info.width, spad.info.height), 1)
+    """Run a configured SPAD once and copy its frames. Raises what `start` raises, and what `fill` raises before any
+    frame has come; what it raises later is logged, and `Grabbed.ended_by`. Stops the SPAD anyway."""
+    info = spad.info
+    row_bytes = packed_row_bytes(info.width)
+    frames = max(timing.stride // frame_bytes(info.width, info.height), 1)
     slots = min(max(_RING_BYTES // timing.stride, _FEWEST_SLOTS), _MOST_SLOTS, -(-n_frames // frames) + _FEWEST_SLOTS)
     ring, blocks, failed = BlockRing(slots, timing.stride), [], []
     reader = ring.reader("grab")
@@ -63,7 +71,7 @@ def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: floa
     def copy() -> None:
         try:
             for block in reader:
-                blocks.append((block.frame_numbers, block.bits.copy(), block.records.copy()))
+                blocks.append((block.frame_numbers, _whole_rows(block, row_bytes), block.records.copy()))
         except BaseException as error:  # raised again on the caller's thread
             failed.append(error)
             reader.close()
@@ -72,17 +80,43 @@ def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: floa
     spad.start(n_frames)
     try:
         copying.start()
-        while spad.fill(ring, timeout_s):
-            pass
+        ended_by = _fill(spad, ring, timeout_s)
     finally:
-        spad.stop()
         ring.finish()
         copying.join()
     if failed:
         raise failed[0]
-    info, parts = spad.info, list(zip(*blocks, strict=True))
+    parts = list(zip(*blocks, strict=True))
     if not parts:
-        nothing = np.zeros((0, info.height, packed_row_bytes(info.width)), np.uint8)
+        if ended_by is not None:
+            raise ended_by
+        nothing = np.zeros((0, info.height, row_bytes), np.uint8)
         return Grabbed(np.zeros(0, np.int64), nothing, np.zeros(0, FRAME_RECORD), n_frames, info.width, timing)
     number, bits, records = (np.concatenate(part) for part in parts)
-    return Grabbed(number, bits, records, n_frames, info.width, timing)
+    if ended_by is not None:
+        _log.error("%s: only %d of %d frames came, which are kept: %s", spad.name, len(number), n_frames, ended_by)
+    return Grabbed(number, bits, records, n_frames, info.width, timing, ended_by)
+
+
+def _fill(spad: "SpadArray", ring: BlockRing, timeout_s: float) -> DeviceError | None:
+    """Fill the ring until the run ends, and stop the SPAD; returns the error by which it ended, if it did."""
+    try:
+        try:
+            while spad.fill(ring, timeout_s):
+                pass
+        finally:
+            spad.stop()
+    except DeviceError as error:
+        return error
+    return None
+
+
+def _whole_rows(block: FrameBlock, row_bytes: int) -> NDArray[np.uint8]:
+    """A copy of the block's frames, each window in its place in a whole row."""
+    window_bytes = block.bits.shape[2]
+    if window_bytes == row_bytes:
+        return block.bits.copy()
+    whole = np.zeros((*block.bits.shape[:2], row_bytes), np.uint8)
+    for frame, bits, x0 in zip(whole, block.bits, block.records["x0"], strict=True):
+        frame[:, x0 // 8 : x0 // 8 + window_bytes] = bits
+    return whole

@@ -312,23 +312,32 @@ class SpadArray(Device):
     ) -> Grabbed:
         """Take `n_frames` whole frames and return them in memory, with the numbers of those that were lost.
 
-        frame_rate_hz: None means the highest with this exposure. exposure_s: None means the longest that a frame
-        allows. mode: None means a stream if sensor and link can do that, else a burst. timeout_s: longest wait for
-        frames. Raises `LimitExceeded` for what the device cannot do, `DeviceTimeout` if no frames come.
+        frame_rate_hz: None means the highest with this exposure that the link carries. exposure_s: None means the
+        longest that a frame allows. mode: None means a stream if sensor and link can do that, else a burst. For a
+        recording, None means as it was taken. timeout_s: longest wait for frames. Raises `LimitExceeded` for what the
+        device cannot do. If the run fails, frames that have come are returned, with the error in `Grabbed.ended_by`; if
+        none have, the error is raised, `DeviceTimeout` for example.
         """
+        request = self._grab_request(n_frames, frame_rate_hz, exposure_s, mode)
+        return take(self, self.configure(request), n_frames, timeout_s)
+
+    def _grab_request(
+        self, n_frames: int, frame_rate_hz: float | Fraction | None, exposure_s: float | None, mode: SpadMode | None
+    ) -> SpadRequest:
+        """The request for a `grab` with these arguments."""
         info = self.info
         rate = info.max_frame_rate_hz if frame_rate_hz is None else Fraction(frame_rate_hz)
         if frame_rate_hz is None and exposure_s is not None and exposure_s > 0:
             rate = min(rate, 1 / Fraction(exposure_s).limit_denominator(10**9))
+        size = frame_bytes(info.width, info.height)
+        carried_hz = 0.0 if info.stream is None else info.stream.bytes_per_s / size
         if mode is None:
-            fits = info.stream is not None and float(rate) * frame_bytes(info.width, info.height) <= (
-                info.stream.bytes_per_s
-            )
-            mode = "stream" if fits or info.burst is None else "burst"
-        block_frames = max(1, min(n_frames, _GRAB_BLOCK_BYTES // frame_bytes(info.width, info.height)))
+            mode = "stream" if float(rate) <= carried_hz or info.burst is None else "burst"
+        if mode == "stream" and frame_rate_hz is None and carried_hz >= 1:
+            rate = min(rate, Fraction(int(carried_hz)))
+        block_frames = max(1, min(n_frames, _GRAB_BLOCK_BYTES // size))
         longest_s = self._longest_exposure_s(1 / rate) if rate > 0 else 0.0
-        request = SpadRequest(rate, longest_s if exposure_s is None else exposure_s, mode, block_frames)
-        return take(self, self.configure(request), n_frames, timeout_s)
+        return SpadRequest(rate, longest_s if exposure_s is None else exposure_s, mode, block_frames)
 
     def _longest_exposure_s(self, period_s: Fraction) -> float:
         """Longest exposure of a frame of this period."""

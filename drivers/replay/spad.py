@@ -22,7 +22,17 @@ from pydantic import AfterValidator, Field
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import FRAME_RECORD, BlockFlag, BlockStatus, FrameBlock, Mark, frame_bytes
-from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode
+from drivers.interfaces import (
+    BurstMode,
+    SpadArray,
+    SpadCounters,
+    SpadInfo,
+    SpadMode,
+    SpadRequest,
+    SpadTiming,
+    StreamMode,
+    WindowTable,
+)
 from drivers.json_text import parse_json
 from drivers.recorded import RecordedRun, RunRecording
 from drivers.registry import Kind, KindConfig, Surroundings
@@ -245,6 +255,18 @@ class ReplaySpad(SpadArray):
     def leave_out(self, runs: Collection[int]) -> None:
         """Skip the starts with these numbers (`RecordedRun.number`)."""
         self._runs = [run for run in self.recording.runs if run.number not in runs]
+
+    def _grab_request(
+        self, n_frames: int, frame_rate_hz: float | Fraction | None, exposure_s: float | None, mode: SpadMode | None
+    ) -> SpadRequest:
+        first = self.recording.runs[0].header
+        if first.frame_period_ticks:
+            frame_rate_hz = first.tick_hz / first.frame_period_ticks if frame_rate_hz is None else frame_rate_hz
+            exposure_s = float(first.exposure_ticks / first.tick_hz) if exposure_s is None else exposure_s
+        mode = mode or ("burst" if first.flags & BlockFlag.BURST else "stream")
+        request = super()._grab_request(n_frames, frame_rate_hz, exposure_s, mode)
+        whole = first.width == first.sensor_width  # else the windows are wherever they were when it was recorded
+        return request if whole else replace(request, window=WindowTable(first.width, (np.zeros(1, np.int32),)))
 
     def _do_configure(self, request: SpadRequest) -> SpadTiming:
         first = self.recording.runs[0].header

@@ -26,8 +26,8 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.frames import BlockFlag, FrameBlock
-from drivers.interfaces import SpadRequest
-from drivers.ring import OnFull
+from drivers.interfaces import DeviceState, SpadRequest
+from drivers.ring import BlockRing, OnFull
 from drivers.spads.spad512s import OWN_ONES, Spad512s, Spad512sConfig
 from drivers.spads.spad512s_line import Deadlines
 from drivers.transports.endpoints import Endpoint
@@ -261,6 +261,31 @@ def test_a_camera_that_sends_one_frame_again_and_again_is_found(ones: int, stuck
     found = rf"frame {stuck_from} is the very same as frame {stuck_from - 1}"
     with connected(Spad512sModel(stuck)) as (device, _), pytest.raises(ProtocolError, match=found):
         device.grab(50)
+
+
+def test_frames_that_came_before_a_run_failed_are_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connected(Spad512sModel(noise)) as (device, _):
+        fill, blocks = device._do_fill, [2]
+
+        def stops(ring: BlockRing, timeout_s: float) -> bool:
+            if blocks[0] == 0:
+                raise DeviceTimeout("the trigger has stopped")
+            blocks[0] -= 1
+            return fill(ring, timeout_s)
+
+        monkeypatch.setattr(device, "_do_fill", stops)
+        got = device.grab(300)
+        came = got.number.size
+        assert 0 < came < 300
+        assert np.array_equal(got.number, np.arange(came))
+        assert np.array_equal(got.lost, np.arange(came, 300))
+        assert isinstance(got.ended_by, DeviceTimeout)
+        assert f"only {came} of 300 frames came" in caplog.text
+        assert device.state is DeviceState.CONFIGURED
+        with pytest.raises(DeviceTimeout, match="has stopped"):
+            device.grab(300)  # nothing came
 
 
 def test_trap_done_glued_to_answers_commands_never_pipelined_and_pile_up_before_every_run() -> None:
