@@ -3,7 +3,8 @@
 It has one ring of samples, played at the set rate while the output is on and there are any, and commands with replies
 of 64 bytes. While the output is off, and once the ring is cleared, X and Y stand at the centre. What happens when the
 ring runs empty is known from the board's ancestor only: this model holds the last sample, or repeats the last ones, as
-configured. How it fills, the timer of the samples and the rate at power-up are the ancestor's too.
+configured. How it fills, the timer of the samples and the rate at power-up are the ancestor's too. So is that the
+newest sample waits in the ring until another one follows, and that a blank one plays first after the ring was cleared.
 """
 
 import math
@@ -29,6 +30,9 @@ _ROOM_TO_GO_ON = 64
 """A packet is taken while more than 8 places are free. Once one was not, 64 must be free (usbuser.c:200-204,
 lasershark.c:356)."""
 _REPEATED_SAMPLES = 64
+_BLANK = np.array([[0, 0, 0x7FF, 0x7FF]], np.uint16)
+"""Sample at the head of a ring that was cleared, one place before that of the first sample (lasershark.c:57-67,
+212-213)."""
 _DONE, _FAILED, _UNKNOWN = 0x00, 0x01, 0xFF
 """Second byte of a reply."""
 
@@ -72,6 +76,8 @@ class LaserCubeModel(DacModel):
         self._when_empty, self._axis, self._clock_error = when_empty, axis, clock_error
         self._ring: deque[NDArray[np.uint16]] = deque()
         self._queued = 0
+        self._newest = _BLANK
+        """The sample that does not play before another one follows (lasershark.c:374-397)."""
         self._full = False
         self._played_to_s = 0.0
         self._last: NDArray[np.uint16] | None = None
@@ -115,7 +121,8 @@ class LaserCubeModel(DacModel):
             return None
         taken = data[: packets * _PACKET_SAMPLES * 8]
         self._full = len(taken) < len(data)
-        samples = np.frombuffer(taken, "<u2").reshape(-1, 4).astype(np.uint16)
+        samples = np.concatenate([self._newest, np.frombuffer(taken, "<u2").reshape(-1, 4).astype(np.uint16)])
+        samples, self._newest = samples[:-1], samples[-1:]
         if not self._queued:
             self._played_to_s = max(self._played_to_s, now_s)
         self._ring.append(samples)
@@ -124,6 +131,7 @@ class LaserCubeModel(DacModel):
 
     def _halt(self, now_s: float) -> None:
         self._ring.clear()
+        self._newest = _BLANK
         self._queued = 0
         self._played_to_s = now_s
 

@@ -99,19 +99,24 @@ def test_it_answers(sent: bytes, answered: bytes) -> None:
     assert number(said(model, b"\x83")) == 30_000
 
 
-def test_samples_of_12_bits_play_one_after_the_other_and_the_last_one_stays_dark() -> None:
+def test_samples_of_12_bits_play_after_a_blank_one_and_the_last_one_waits_for_the_next() -> None:
     model = opened()
     assert model.out(SAMPLES, samples(0xABC, 0x1001), 1.0) == 16
     at = 1.0 + np.array([0.5, 1.5, 9]) / 30_000
-    assert x(model, *at) == [0xABC, 0x001, 0x001]  # dac124s085.c: masked; lasershark.c:374-387: kept
-    assert [colours(model, each) for each in at] == [[1, 2, 3], [1, 2, 3], [0, 0, 0]]
+    # lasershark.c:57-67, 212-213: the head is one place before the first sample, and blank; 374-397: it plays unless the
+    # tail follows it at once; then values are kept, dark
+    assert x(model, *at) == [MID, 0xABC, 0xABC]
+    assert [colours(model, each) for each in at] == [[0, 0, 0], [1, 2, 3], [0, 0, 0]]
+    model.out(SAMPLES, samples(0x7), 2.0)
+    assert x(model, 2.0 + 0.5 / 30_000, 3.0) == [0x001, 0x001]  # dac124s085.c: masked
+    assert colours(model, 2.0 + 0.5 / 30_000) == [1, 2, 3]
 
 
 def test_a_sample_lasts_a_whole_number_of_ticks_of_the_timer() -> None:
     model = opened()
     said(model, b"\x82" + struct.pack("<I", 35_000))  # lasershark.c:313: 72 MHz / 35 kHz is 2057.14 ticks
-    model.out(SAMPLES, samples(*[1] * 700, 9), 1.0)
-    ends_s = 1.0 + 700 * 2057 / 72e6
+    model.out(SAMPLES, samples(*[1] * 700, 9, 9), 1.0)
+    ends_s = 1.0 + 701 * 2057 / 72e6  # after a blank one
     assert x(model, ends_s - 1e-7, ends_s + 1e-7) == [1, 9]
 
 
