@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from fractions import Fraction
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, TypeVar
 
@@ -13,7 +12,7 @@ from drivers.errors import LimitExceeded, UnknownKind
 from drivers.interfaces import World
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import Tap
-from drivers.units import format_quantity
+from drivers.units import IN_NAMES, dimension_of, format_quantity
 
 SLOTS = ("spad", "scanner", "laser", "sync", "world")
 """The parts of a rig. The kinds of slot `spad` are the entry points of group `spadrig.spad`, and so on."""
@@ -69,8 +68,21 @@ Config = TypeVar("Config", bound=BaseModel)
 
 
 def config_of(kind: type[Config], **fields: object) -> Config:
-    """The config of a device that is opened by itself, without a file. Raises `LimitExceeded`, with one line, for
-    the first wrong field."""
+    """The config of a device that is opened by itself, without a file. A key with a unit takes text, as in a file, or,
+    with that unit added to its name, a number in SI units: `max_power_w=0.05`. One with a unit that is None counts as
+    not given. Raises `LimitExceeded`, with one line, for the first wrong field."""
+    for name, about in kind.model_fields.items():
+        dimension = dimension_of(about)
+        if dimension is None:
+            continue
+        key = "_".join(filter(None, (name, IN_NAMES[dimension])))
+        if not isinstance(fields.get(name, ""), str) and key != name:
+            raise LimitExceeded(f"{name} is {fields[name]!r}; give {key}, a number in SI units")
+        value = fields.get(key)
+        if key in fields and not isinstance(value, str):
+            del fields[key]
+            if value is not None:
+                fields[name] = _quantity(key, value, dimension)
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
@@ -79,7 +91,7 @@ def config_of(kind: type[Config], **fields: object) -> Config:
         raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None
 
 
-def quantity(name: str, value: float | Fraction, dimension: str) -> str:
+def _quantity(name: str, value: Any, dimension: str) -> str:
     """An argument in SI units, written as text with a unit. Raises `LimitExceeded` if it is no finite number."""
     try:
         return format_quantity(value, dimension)

@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Context, Decimal
 from fractions import Fraction
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
 _NUMBER = re.compile(
@@ -163,6 +164,33 @@ def _means(text: str, value: float | Fraction, dimension: str) -> bool:
 def _shown(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:36]}...{text[-1]}"
+
+
+IN_NAMES: Mapping[str, str] = {
+    "time": "s",
+    "age": "s",
+    "frequency": "hz",
+    "length": "m",
+    "power": "w",
+    "voltage": "v",
+    "inverse length": "per_m",
+    "angle": "rad",
+    "illuminance": "lux",
+    "ratio": "",
+    "speed": "m_per_s",
+    "rain rate": "m_per_h",
+    "count rate": "cps",
+    "data rate": "bytes_per_s",
+    "rate": "per_s",
+    "acceleration": "per_s2",
+}
+"""Unit of each dimension as names in code have it: `power_w`. A ratio has none."""
+
+
+def dimension_of(field: FieldInfo) -> str | None:
+    """The dimension of a config's field that is a quantity, or may be one; None if it is something else."""
+    marks = [mark for part in get_args(field.annotation) for mark in get_args(part)]
+    return next((mark.dimension for mark in (*field.metadata, *marks) if isinstance(mark, _Text)), None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from pydantic import Field
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
-from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.transports.dialogue import DONE, FLAG, NUMBER, Dialogue, LineTiming
 from drivers.units import Seconds
 
@@ -221,8 +221,7 @@ class CoboltLaser(SerialLaser):
         sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
         `DeviceError` if the laser cannot be opened.
         """
-        power = quantity("max_power_w", max_power_w, "power")
-        return create(config_of(CoboltConfig, port=port, max_power=power, **settings), surroundings or alone())
+        return create(config_of(CoboltConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 
     def _do_status(self) -> LaserStatus:
         line = self._line

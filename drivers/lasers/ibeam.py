@@ -29,7 +29,7 @@ from drivers.clock import NS_PER_S
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, DeviceNotFound, ProtocolError
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
-from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.transports.dialogue import DONE, Dialogue, LineTiming
 from drivers.transports.serial_port import SerialPort
 
@@ -155,8 +155,7 @@ class IbeamLaser(SerialLaser):
         surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError`
         if the laser cannot be opened.
         """
-        power = quantity("max_power_w", max_power_w, "power")
-        return create(config_of(IbeamConfig, port=port, max_power=power, **settings), surroundings or alone())
+        return create(config_of(IbeamConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 
     def _do_status(self) -> LaserStatus:
         on, mode = self._on(), self._input_mode()

@@ -35,7 +35,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import LaserLimits, LaserStatus
 from drivers.lasers.serial_laser import SerialLaser, SerialLaserConfig, open_laser, require_serial_number
-from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.transports.dialogue import DONE, NUMBER, Dialogue, LineTiming
 from drivers.units import Seconds
 
@@ -210,8 +210,7 @@ class ObisLaser(SerialLaser):
         sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
         `DeviceError` if the laser cannot be opened.
         """
-        power = quantity("max_power_w", max_power_w, "power")
-        return create(config_of(ObisConfig, port=port, max_power=power, **settings), surroundings or alone())
+        return create(config_of(ObisConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 
     def _do_status(self) -> LaserStatus:
         line = self._line

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from drivers.errors import DeviceNotFound
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.transports.endpoints import EMULATED_PREFIX, resolve
 from drivers.units import Watts, format_quantity
 
@@ -62,9 +62,8 @@ class TtlLaser(LineLaser):
         power_w: power that is set at the laser by hand. max_power_w: most power that may ever be sent out; None:
         `power_w`. Raises `LimitExceeded` for a power that is not possible.
         """
-        power = quantity("power_w", power_w, "power")
-        most = power if max_power_w is None else quantity("max_power_w", max_power_w, "power")
-        return create(config_of(TtlConfig, power=power, max_power=most), alone())
+        most_w = power_w if max_power_w is None else max_power_w
+        return create(config_of(TtlConfig, power_w=power_w, max_power_w=most_w), alone())
 
     @property
     def identity(self) -> str:

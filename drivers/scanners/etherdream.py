@@ -24,7 +24,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceNotFound
 from drivers.interfaces import ScannerStatus
-from drivers.registry import Kind, Surroundings, config_of, quantity
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacRun, DacScanner, PointSource
 from drivers.scanners.etherdream_line import (
     CLEAR,
@@ -282,10 +282,10 @@ class EtherDream(DacScanner):
         config = config_of(
             EtherDreamConfig,
             port=port,
-            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
-            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
-            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
-            buffer=quantity("buffer_s", buffer_s, "time"),
+            max_velocity_per_s=max_velocity_per_s,
+            max_acceleration_per_s2=max_acceleration_per_s2,
+            max_point_rate_hz=max_point_rate_hz,
+            buffer_s=buffer_s,
             **settings,
         )
         return _opened(config, Endpoint(port), clock or SystemClock())

@@ -41,7 +41,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.registry import Kind, Surroundings, config_of, quantity
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
@@ -438,10 +438,10 @@ class Helios(DacScanner):
         config = config_of(
             HeliosConfig,
             port=port,
-            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
-            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
-            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
-            frame=quantity("frame_s", frame_s, "time"),
+            max_velocity_per_s=max_velocity_per_s,
+            max_acceleration_per_s2=max_acceleration_per_s2,
+            max_point_rate_hz=max_point_rate_hz,
+            frame_s=frame_s,
             **settings,
         )
         return _opened(config, Endpoint(port, usb_backend), clock or SystemClock())

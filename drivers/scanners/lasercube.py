@@ -37,7 +37,7 @@ from pydantic import Field
 from drivers.clock import Clock, SystemClock, now_s
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN
-from drivers.registry import Kind, Surroundings, config_of, quantity
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import (
     CENTRE,
     DRIFT,
@@ -353,10 +353,10 @@ class LaserCube(DacScanner):
         config = config_of(
             LaserCubeConfig,
             port=port,
-            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
-            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
-            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
-            buffer=quantity("buffer_s", buffer_s, "time"),
+            max_velocity_per_s=max_velocity_per_s,
+            max_acceleration_per_s2=max_acceleration_per_s2,
+            max_point_rate_hz=max_point_rate_hz,
+            buffer_s=buffer_s,
             **settings,
         )
         return _opened(config, Endpoint(port, usb_backend), clock or SystemClock())

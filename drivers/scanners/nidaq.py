@@ -45,7 +45,7 @@ from drivers.errors import (
     ProtocolError,
 )
 from drivers.interfaces import LEVEL_BACKWARD, MARKER_LINE, MARKER_SCAN, ScanWaveform
-from drivers.registry import Kind, Surroundings, config_of, quantity
+from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import PATIENCE_S, DacRun, DacScanner, PointSlice, PointSource
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
 from drivers.scanners.nidaq_card import CALL_S, GRPC_PREFIX, NiCard
@@ -488,11 +488,11 @@ class Nidaq(DacScanner):
         config = config_of(
             NidaqConfig,
             port=port,
-            max_velocity=quantity("max_velocity_per_s", max_velocity_per_s, "rate"),
-            max_acceleration=quantity("max_acceleration_per_s2", max_acceleration_per_s2, "acceleration"),
-            full_scale=quantity("full_scale_v", full_scale_v, "voltage"),
-            max_point_rate=quantity("max_point_rate_hz", max_point_rate_hz, "frequency"),
-            buffer=quantity("buffer_s", buffer_s, "time"),
+            max_velocity_per_s=max_velocity_per_s,
+            max_acceleration_per_s2=max_acceleration_per_s2,
+            full_scale_v=full_scale_v,
+            max_point_rate_hz=max_point_rate_hz,
+            buffer_s=buffer_s,
             **settings,
         )
         return cls(NidaqDac(config, port, host_clock or SystemClock()), config)

@@ -31,7 +31,7 @@ from pydantic import Field
 from drivers.errors import DeviceFault, DeviceNotFound, DeviceTimeout, LimitExceeded, ProtocolError
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
 from drivers.interfaces import BurstMode, SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.ring import BlockRing
 from drivers.spads.orientation import QuarterTurn, turn_packed, turned_size
 from drivers.spads.spad512s_line import DONE, ERROR, Deadlines, Spad512sLine
@@ -272,9 +272,8 @@ class Spad512s(SpadArray):
         None for that of the 512 x 512 sensor. surroundings: of an emulator. Raises `LimitExceeded` for a setting that
         is not possible, other `DeviceError` if the device cannot be reached.
         """
-        if max_frame_rate_hz is not None:
-            settings["max_frame_rate"] = quantity("max_frame_rate_hz", max_frame_rate_hz, "frequency")
-        return create(config_of(Spad512sConfig, port=port, **settings), surroundings or alone())
+        config = config_of(Spad512sConfig, port=port, max_frame_rate_hz=max_frame_rate_hz, **settings)
+        return create(config, surroundings or alone())
 
     @property
     def info(self) -> SpadInfo:

@@ -15,7 +15,7 @@ from drivers.clock import Clock, now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout, LimitExceeded
 from drivers.frames import frame_bytes
 from drivers.interfaces import SpadArray, SpadCounters, SpadHealth, SpadInfo, SpadRequest, SpadTiming
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.ring import BlockRing
 from drivers.spads.spb_usb_setup import (
     LABEL,
@@ -111,8 +111,7 @@ class SpbUsb(SpadArray):
         a run. settings: reads, test_pattern, as in `SpbUsbConfig`. surroundings: of an emulator. Raises `LimitExceeded`
         for a setting that is not possible, other `DeviceError` if the device cannot be opened.
         """
-        heartbeat = quantity("heartbeat_s", heartbeat_s, "time")
-        config = config_of(SpbUsbConfig, port=port, chip=chip, heartbeat=heartbeat, **settings)
+        config = config_of(SpbUsbConfig, port=port, chip=chip, heartbeat_s=heartbeat_s, **settings)
         return create(config, surroundings or alone())
 
     @property

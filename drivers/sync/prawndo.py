@@ -22,7 +22,7 @@ from pydantic import Field
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
 from drivers.interfaces import Pulse, SyncStatus, sliced
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
 from drivers.sync.prawndo_line import IDLE, USUAL_TIMING, PrawnDoLine, PrawnDoTiming
 from drivers.transports.endpoints import resolve
@@ -183,8 +183,7 @@ class PrawnDo(SerialDevice, SyncBoard):
         clock on GPIO20, None for the board's own. surroundings: of an emulator. Raises `LimitExceeded` for a setting
         that is not possible, other `DeviceError` if the board cannot be opened.
         """
-        clock = None if external_clock_hz is None else quantity("external_clock_hz", external_clock_hz, "frequency")
-        config = config_of(PrawnDoConfig, port=port, external_clock=clock, **settings)
+        config = config_of(PrawnDoConfig, port=port, external_clock_hz=external_clock_hz, **settings)
         return cls(config, surroundings or alone())
 
     def ask(self, command: str) -> list[str]:

@@ -48,7 +48,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, Surroundings, alone, config_of
 from drivers.sync.board import BoardConfig, OutputPins, SyncBoard
 from drivers.sync.pulsestreamer_rpc import CALL_S, JsonRpc
 from drivers.sync.pulsestreamer_sequence import (
@@ -167,8 +167,7 @@ class PulseStreamer(SyncBoard):
         the longest silence of the box while a program runs. surroundings: of an emulator. Raises `LimitExceeded` for a
         setting that is not possible, other `DeviceError` if the box cannot be opened.
         """
-        silence = quantity("silence_s", silence_s, "time")
-        config = config_of(PulseStreamerConfig, port=port, silence=silence, **settings)
+        config = config_of(PulseStreamerConfig, port=port, silence_s=silence_s, **settings)
         return cls(config, surroundings or alone())
 
     def ask(self, method: str, *params: Any) -> Any:

@@ -23,7 +23,7 @@ from pydantic import Field
 from drivers.errors import DeviceError, DeviceFault, LimitExceeded, ProtocolError
 from drivers.interfaces import HOLD_S, Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
-from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of, quantity
+from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.sync.board import SyncBoard
 from drivers.sync.teensy_line import DONE, REPLY_S, STATUS, TRIES, TeensyLine
 from drivers.transports.endpoints import resolve
@@ -129,8 +129,7 @@ class Teensy(SerialDevice, SyncBoard):
         plays, 0.2 to 60 s. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible,
         other `DeviceError` if the board cannot be opened.
         """
-        watchdog = quantity("watchdog_s", watchdog_s, "time")
-        return cls(config_of(TeensyConfig, port=port, watchdog=watchdog), surroundings or alone())
+        return cls(config_of(TeensyConfig, port=port, watchdog_s=watchdog_s), surroundings or alone())
 
     def ask(self, command: str) -> str:
         """Send a raw command, once, and return the board's answer, also if it is an error. Nothing is checked: `run`

@@ -103,8 +103,8 @@ def test_samples_of_12_bits_play_after_a_blank_one_and_the_last_one_waits_for_th
     model = opened()
     assert model.out(SAMPLES, samples(0xABC, 0x1001), 1.0) == 16
     at = 1.0 + np.array([0.5, 1.5, 9]) / 30_000
-    # lasershark.c:57-67, 212-213: the head is one place before the first sample, and blank; 374-397: it plays unless the
-    # tail follows it at once; then values are kept, dark
+    # lasershark.c:57-67, 212-213: the head is one place before the first sample, and blank. 374-397: it plays unless
+    # the tail follows it at once; then values are kept, dark.
     assert x(model, *at) == [MID, 0xABC, 0xABC]
     assert [colours(model, each) for each in at] == [[0, 0, 0], [1, 2, 3], [0, 0, 0]]
     model.out(SAMPLES, samples(0x7), 2.0)

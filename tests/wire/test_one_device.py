@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -21,10 +22,11 @@ from drivers.clock import VirtualClock, now_s
 from drivers.errors import LimitExceeded, WrongState
 from drivers.interfaces import LineLaser
 from drivers.lasers import cobolt, ibeam, obis
-from drivers.registry import Surroundings
+from drivers.registry import Surroundings, config_of, kinds, lookup
 from drivers.spads import spad512s, spb_usb
 from drivers.sync import prawndo, pulsestreamer, teensy
 from drivers.transports.endpoints import Endpoint
+from drivers.units import IN_NAMES, dimension_of
 from sim_backend.wire.firmware.cobolt import CoboltModel
 from sim_backend.wire.firmware.helios import HeliosModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
@@ -244,3 +246,46 @@ def test_an_spb1_spad_is_opened_by_itself_and_grabs(monkeypatch: pytest.MonkeyPa
         assert not len(got.lost)
     with pytest.raises(LimitExceeded, match="heartbeat"):
         spb_usb.SpbUsb.open(heartbeat_s=100.0, surroundings=surroundings)
+
+
+NEEDED: dict[str, dict[str, object]] = {
+    "spad": {},
+    "scanner": {"port": "emulated:mirror", "max_velocity_per_s": 400, "max_acceleration_per_s2": 1e6},
+    "laser": {"port": "emulated:laser", "max_power_w": 0.05},
+    "sync": {"port": "emulated:sync"},
+}
+BESIDE: dict[str, dict[str, object]] = {"clock_rate": {"clock": "PFI0"}}
+"""Keys that must be given together with another one."""
+QUANTITIES = [
+    (slot, kind, name, f"{name}_{IN_NAMES[dimension]}")
+    for slot in NEEDED
+    for kind in kinds(slot)
+    if kind not in ("simulated", "replay", "ttl")
+    for name, field in lookup(slot, kind).config.model_fields.items()
+    if (dimension := dimension_of(field)) is not None
+]
+
+
+@pytest.mark.parametrize(("slot", "kind", "name", "key"), QUANTITIES)
+def test_a_key_with_a_unit_is_a_number_in_code_and_its_name_has_the_unit(
+    slot: str, kind: str, name: str, key: str
+) -> None:
+    config = lookup(slot, kind).config
+    usual = config.model_fields[name].default
+    value = usual if isinstance(usual, float | Fraction) else NEEDED[slot].get(key, 20_000.0)
+    beside = NEEDED[slot] | BESIDE.get(name, {})
+    assert getattr(config_of(config, **beside | {key: value}), name) == value
+    with pytest.raises(LimitExceeded, match=f"{name} is .*; give {key}, a number in SI units"):
+        config_of(config, **beside | {name: value})
+    with pytest.raises(LimitExceeded, match=f"{key} is .*; give a number in SI units"):
+        config_of(config, **beside | {key: float("nan")})
+
+
+def test_open_takes_every_key_of_a_config_as_the_page_says() -> None:
+    assert {key for *_, key in QUANTITIES} >= {"warm_up_s", "silence_s", "clock_rate_hz", "start_wait_s"}
+    assert {key for *_, key in QUANTITIES} >= {"trigger_pulse_s", "readout_bytes_per_s", "max_power_w"}
+    with wire(ObisModel()) as (_, surroundings):
+        settings = {"warm_up_s": 900.0, "silence_s": 0.3}
+        obis.ObisLaser.open("emulated:laser", max_power_w=0.05, surroundings=surroundings, **settings).close()
+    with board() as made:
+        prawndo.PrawnDo.open("emulated:sync", trigger_pulse_s=50e-6, surroundings=made.surroundings).close()
