@@ -122,7 +122,7 @@ class ReplayRequest(RunRequest):
     """A recording that is played as if it were taken now (`rig replay`)."""
 
     clock: str = option("realtime", "realtime, max, x4 or x0.1, or step (Enter: one sweep more)")
-    loop: bool = option(False, "play it again and again, until Ctrl-C or --maps")
+    loop: bool = option(False, "play it again and again, until Ctrl-C or `maps`")
     maps: int | None = option(None, "depth maps to make", unset="all")
     config: Any = option(
         None,
@@ -132,7 +132,7 @@ class ReplayRequest(RunRequest):
     )
     threads: int | None = option(None, "threads that count and estimate", unset="as recorded")
     block_frames: int | None = option(None, "most frames of a block", unset="5 ms", least=1)
-    save: str | None = option(None, "maps to write: all, last or every N", unset="all, of the command with --loop last")
+    save: str | None = option(None, "maps to write: all, last or every N", unset="all, of the command with `loop` last")
     on_overload: str = option("abort", "where frames come too fast: abort and block wait, drop counts them")
 
 
@@ -181,7 +181,7 @@ class CutRequest:
     maps: str | None = option(None, "A:B, maps A to before B, from 0")
     frames: str | None = option(None, "A:B, frames A to before B")
     time: str | None = option(None, "A:B, seconds A to B from the first frame")
-    start: int = option(0, "of --frames and --time: which start of the SPAD, from 0")
+    start: int = option(0, "of `frames` and `time`: which start of the SPAD, from 0")
 
 
 @described
@@ -259,12 +259,12 @@ class PlanesRequest(BoardRequest):
 
     guided: bool = option(False, "ask for the poses that help most, until it is enough or all poses were shown")
     calibration: str | os.PathLike[str] | None = path_option("one to start from; its defects are kept", "none")
-    camera: str | os.PathLike[str] | None = path_option("camera.yaml of `calibrate camera`, of other views", "none")
+    camera: str | os.PathLike[str] | None = path_option("camera.yaml of calibrate camera, of other views", "none")
     stated_baseline: str | None = option(None, "camera to mirror as measured: '300 mm'", unset="not known")
     accuracy: str | None = _accuracy()
     at: str = _at()
     exposures: Sequence[int] = _exposures_by_turns()
-    accept_calibration: bool = option(False, "use a --camera whose verdict failed all the same")
+    accept_calibration: bool = option(False, "use a `camera` whose verdict failed all the same")
 
 
 @described
@@ -284,7 +284,7 @@ class SyncRequest(CalibrationRequest):
 class CheckRequest(BoardRequest):
     """A check of a calibration by a board that was not used for it (`rig calibrate check`)."""
 
-    poses: int = option(1, "of the board, shown to a live rig; at least 2 with --angle")
+    poses: int = option(1, "of the board, shown to a live rig; at least 2 with `angle`")
     calibration: str | os.PathLike[str] | None = path_option("what to check", "the rig's own")
     angle: str | None = option(
         None, "between the boards of the first two views, as stated: '30 deg'", unset="not known"

@@ -67,7 +67,7 @@ class ValueSources:
 
     def flag(self, key: Key) -> str | None:
         """The option by which the value of a key was given, if that has a name of its own; else None."""
-        return self.flags.get(key) if self._is_option(key) else None
+        return f"`{self.flags[key]}`" if self._is_option(key) and key in self.flags else None
 
     def place(self, key: Key) -> str:
         """The beginning of a message: 'option:', or the file, with the line if it has one."""
@@ -292,7 +292,9 @@ def _then(key: Key, schema: _Schema, flag: str | None) -> str:
     info = schema.field(key)
     if info is None or not info.examples:
         return ""
-    return f"; write for example '{f'{_named(key)[-1]}: ' if flag is None else f'{flag} '}{info.examples[0]}'"
+    example = info.examples[0]
+    said = f"'{_named(key)[-1]}: {example}'" if flag is None else f"{flag[:-1]}={example}`"
+    return f"; write for example {said}"
 
 
 def _unknown_key(key: Key, schema: _Schema) -> str:

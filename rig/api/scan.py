@@ -219,7 +219,7 @@ def reconstruct(
         require_recording(source)
     if source.is_dir() and not holds_frames_alone(source):
         if plan is not None and (source / PLAN_FILE).exists():
-            raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave --plan out")
+            raise UsageError(f"{source} is a recording, which has the plan it was taken with; leave `plan` out")
         if isinstance(calibration, RigModel):
             raise UsageError(
                 "the calibration for a recording is a file; calibration.files.rig_file.save_rig_model writes one"
@@ -228,9 +228,9 @@ def reconstruct(
         return replay(source, clock="max", calibration=calibration, progress=progress, **asked)
     if plan is None or calibration is None:
         if not source.exists():
-            said = "does not exist; name the folder of a run taken with --record, or an .npy of frames"
+            said = "does not exist; name the folder of a run taken with `record`, or an .npy of frames"
             raise UsageError(f"{source} {said}")
-        missing = [name for name, given in (("--plan", plan), ("--calibration", calibration)) if given is None]
+        missing = [name for name, given in (("`plan`", plan), ("`calibration`", calibration)) if given is None]
         raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)} to say how they were taken")
     estimate = _estimate(request)
     cube_plan = plan if isinstance(plan, CubePlan) else load_cube_plan(Path(plan))

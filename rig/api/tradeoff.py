@@ -50,7 +50,7 @@ def tradeoff(
     if loaded.estimate.temporal_prior and set(request.estimators) != {"joint"}:
         problems.append(
             f"{loaded.name} has estimate.temporal_prior, which is for joint alone; leave it out of the config or try "
-            "--estimators joint"
+            "`estimators=joint`"
         )
     if request.repeat < 1:
         problems.append(f"repeat is {request.repeat}; it must be at least 1")

@@ -59,7 +59,7 @@ def calibrate_check(
     live = found.live
     file = Path(request.calibration) if request.calibration is not None else None if live is None else live.calibration
     if file is None:
-        raise UsageError("there is no calibration to check; name one with --calibration")
+        raise UsageError("there is no calibration to check; name one as `calibration`")
     model = load_rig_model(file)
     views_needed = 1 if stated_rad is None else 2
     require_live(live, ask, request.arm)
@@ -139,7 +139,7 @@ def _summary(
 def _consequence(file: Path, *, noted: bool) -> list[tuple[str, str]]:
     """Line on what a failed check changes, and how to undo it. noted: whether it could be noted."""
     refused = (
-        f"scan, replay and reconstruct refuse {file} (or take it with --accept-calibration); a check of it that "
+        f"scan, replay and reconstruct refuse {file} (or take it with `accept_calibration=True`); a check of it that "
         "passes, with the right angle or board, takes that back"
     )
     return [("from now on", refused if noted else f"nothing refuses {file}: the check could not be noted beside it")]

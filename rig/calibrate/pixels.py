@@ -412,7 +412,7 @@ def _written(result: PixelResult, folder: RunFolder, calibration: Path | None) -
     except CalibrationError as error:
         raise UsageError(f"calibration: {error}") from error
     except OSError as error:
-        raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
+        raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another `out`") from error
     written = replace(
         result, folder=folder.path, calibration=None if calibration is None else folder.path / CALIBRATION_FILE
     )

@@ -189,7 +189,7 @@ class Session:
         if digest in self._of_camera:
             raise UsageError(
                 f"{where} holds a view that the camera was made of; a view must not count twice: give other views "
-                "(of a simulated rig: another --seed), or leave the camera out"
+                "(of a simulated rig: another `seed`), or leave the camera out"
             )
         if digest in self._seen:
             raise UsageError(

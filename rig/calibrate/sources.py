@@ -64,7 +64,7 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
                 found += inside
             else:
                 problems.append(
-                    f"{path} holds neither views nor a recording nor pictures; name a run taken with --record, the "
+                    f"{path} holds neither views nor a recording nor pictures; name a run taken with `record`, the "
                     "folder of an earlier calibration or a config"
                 )
         elif path is not None and path.suffix.lower() in PICTURES:
@@ -81,7 +81,7 @@ def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | N
         problems.append(f"{len(live)} rigs are named; one at a time can be calibrated")
     if found and not pictures:
         problems.append(
-            f"{found[0]} is a picture, which serves 'rig calibrate camera' only; name runs taken with --record"
+            f"{found[0]} is a picture, which serves 'rig calibrate camera' only; name runs taken with `record`"
         )
     known = dict[Path, Path]()
     for path in (*sessions, *recorded, *found):

@@ -152,7 +152,7 @@ def _require_alike(folder: Path, board: Board | None) -> None:
     if _print(known) != _print(board):
         raise UsageError(
             f"{folder} holds views of a {_print(known)}, looked for is a {_print(board)}; name the board that was "
-            f"shown: --board {file}"
+            f"shown: `board={file}`"
         )
 
 

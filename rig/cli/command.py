@@ -7,9 +7,10 @@ import errno
 import functools
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import Field, dataclass
+from dataclasses import Field, dataclass, is_dataclass
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
+from rig import requests
 from rig.cli.completion import Kind, one_of, some_of
 from rig.errors import UsageError
 from rig.requests import options_of
@@ -120,6 +122,20 @@ def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
     return wrapped
 
 
+_SETTING = re.compile("`([a-z_]+)(?:=([^`]*))?`")
+"""A setting that a message names as in Python: `out`, `arm=True`, `view='frames'`."""
+
+
+def in_options(text: str) -> str:
+    """Text with the settings that it names as in Python named as options: --out, --arm, --view frames."""
+
+    def option(setting: re.Match[str]) -> str:
+        name, value = _OPTIONS.get(setting[1], setting[0]), (setting[2] or "").strip("'")
+        return f"{name} {value}" if setting[1] in _OPTIONS and value not in ("", "True") else name
+
+    return _SETTING.sub(option, text)
+
+
 def split_option(option: str, given: list[str] | None) -> list[str]:
     """Split an option that may be given several times and with commas. Empty if it is not given; raises UsageError if
     only empty values are given."""
@@ -172,14 +188,25 @@ def _option_name(field: "Field[Any]") -> str:
     return f"--{(field.metadata['name'] or field.name).replace('_', '-')}"
 
 
+_OPTIONS = {name: f"--{name}" for name in ("plan", "row", "column")} | {
+    field.name: _option_name(field)
+    for request in vars(requests).values()
+    if is_dataclass(request) and isinstance(request, type)
+    for field in options_of(request)
+}
+"""Options by the setting's name in Python: those of all requests, and those that commands have beside a request."""
+
+
 def _parameter(field: "Field[Any]") -> inspect.Parameter:
     """The parameter of a command from which typer makes the option for a field."""
     told, name, many = field.metadata, _option_name(field), field.type in _MANY
     kind_of_name = next((one for one in get_args(Kind) if one == field.name.removesuffix("s")), None)
     option = typer.Option(
         name if field.default is not True and field.type != bool | None else f"{name}/--no-{name[2:]}",
-        help=told["about"],
-        show_default="runs/DATE-TIME" if field.name == "out" else told["unset"] or field.default is not None,
+        help=in_options(told["about"]),
+        show_default="runs/DATE-TIME"
+        if field.name == "out"
+        else in_options(told["unset"]) or field.default is not None,
         min=told["least"],
         autocompletion=None if kind_of_name is None else (some_of if many else one_of)(kind_of_name),
     )
@@ -251,7 +278,7 @@ def print_json(content: Mapping[str, Any]) -> None:
     """Print the one JSON object of a command to stdout."""
     from rig.run_folder.folder import json_text
 
-    print(json_text(content))
+    print(in_options(json_text(content)))
 
 
 def say_space(space: "Space") -> None:
@@ -261,4 +288,4 @@ def say_space(space: "Space") -> None:
 
 def say(line: str) -> None:
     """Print a line for people to stderr."""
-    print(line, file=sys.stderr, flush=True)
+    print(in_options(line), file=sys.stderr, flush=True)

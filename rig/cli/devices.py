@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import EXIT_DEVICE, Answer, Commands, ConfigArgument, api, print_json
+from rig.cli.command import EXIT_DEVICE, Answer, Commands, ConfigArgument, api, in_options, print_json
 
 
 def doctor_command(
@@ -18,7 +18,7 @@ def doctor_command(
     could_scan = all(one.ok for one in findings)
     lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
     content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
-    return Answer(content, lambda: print("\n".join(lines)), 0 if could_scan else EXIT_DEVICE)
+    return Answer(content, lambda: print(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
 
 
 def devices_command() -> Answer:

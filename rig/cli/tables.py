@@ -14,6 +14,7 @@ from drivers.replay.pace import PaceReport
 from rig.bench.frames import COLUMNS
 from rig.bench.soak import SoakReport
 from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
+from rig.cli.command import in_options
 from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
 from rig.scan.run import RunResult
 from rig.tradeoff.effects import Effect, Flux, SceneEffects
@@ -57,7 +58,7 @@ def _print_pairs(pairs: Iterable[tuple[str, str]], width: int | None = None) -> 
     table.add_column(style="bold")
     table.add_column()
     for pair in pairs:
-        table.add_row(*pair)
+        table.add_row(*map(in_options, pair))
     console(width).print(table)
 
 

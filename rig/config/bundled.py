@@ -30,7 +30,7 @@ def bundled_rigs() -> tuple[Bundled, ...]:
 
 
 def bundled_scenes() -> tuple[Bundled, ...]:
-    """The scenes that simulated rigs take by name as --scene, sorted by name."""
+    """The scenes that simulated rigs take by name as `scene`, sorted by name."""
     return tuple(_bundled(path) for path in _by_name(SCENES))
 
 

@@ -24,17 +24,17 @@ from rig.config.models import CubePlan, RigConfig
 from rig.errors import UsageError
 
 FLAGS: Mapping[Key, str] = {
-    ("world", "scene"): "--scene",
-    ("world", "fog"): "--fog",
-    ("scan", "exposures"): "--exposures",
-    ("estimate", "estimator"): "--estimator",
-    ("estimate", "filter"): "--filter",
-    ("estimate", "min_confidence"): "--min-confidence",
-    ("estimate", "temporal_prior"): "--temporal-prior",
-    ("estimate", "learned"): "--learned",
-    ("estimate", "threads"): "--threads",
+    ("world", "scene"): "scene",
+    ("world", "fog"): "fog",
+    ("scan", "exposures"): "exposures",
+    ("estimate", "estimator"): "estimator",
+    ("estimate", "filter"): "filter",
+    ("estimate", "min_confidence"): "min_confidence",
+    ("estimate", "temporal_prior"): "temporal_prior",
+    ("estimate", "learned"): "learned",
+    ("estimate", "threads"): "threads",
 }
-"""Options of the command line, by the key of the config that each sets."""
+"""Names of the options of a call that set a key of the config, by this key."""
 
 
 def kind_of(slot: str, content: Any) -> type[BaseModel] | None:
@@ -93,7 +93,7 @@ def load_cube_plan(path: str | Path) -> CubePlan:
     keys = f"the plan of frames alone has {', '.join(CubePlan.model_fields)}"
     if {"spad", "scanner"} <= read.content.keys():
         raise UsageError(f"{path} is the config of a rig; {keys}")
-    leave = "leave --plan out; " if read.content.get("format") == PLAN_FORMAT else ""
+    leave = "leave `plan` out; " if read.content.get("format") == PLAN_FORMAT else ""
     _refuse_others(path, read.content, f"{leave}{keys}")
     return _validated(CubePlan, read.content, ValueSources(_shown(Path(path)), read.lines), Path(path).parent)
 
@@ -178,7 +178,7 @@ def find_config(name_or_path: str | Path) -> Path:
     close = difflib.get_close_matches(path.stem, names, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
     if path.name in (one.name for one in bundled_scenes()):
-        meant = f"it is a scene, which is chosen by --scene {path.name}; "
+        meant = f"it is a scene, which is chosen by `scene={path.name}`; "
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
         f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "

@@ -172,7 +172,7 @@ class EstimateConfig(ConfigSection):
     )
     temporal_prior: bool = Field(
         default=False,
-        description="hold each map to the last one a little, for scenes that mostly stand still; `joint` only",
+        description="hold each map to the last one a little, for scenes that mostly stand still; joint only",
         examples=["true"],
     )
     learned: Annotated[Path | None, AfterValidator(_beside_config)] = Field(

@@ -53,9 +53,9 @@ def configure(
     loaded = config if isinstance(config, RigConfig) else load_config(os.fspath(config))
     for name, asked in (("scene", scene), ("fog", fog)):
         if asked is not None and loaded.world is None:
-            raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave --{name} out")
+            raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave `{name}` out")
     if scene is not None and scene in bundled_configs() and not Path(scene).expanduser().exists():
-        raise UsageError(f"scene {scene!r} is a rig; give it as the config, without --scene")
+        raise UsageError(f"scene {scene!r} is a rig; give it as the config, without `scene`")
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded

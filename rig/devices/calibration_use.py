@@ -29,7 +29,7 @@ from rig.run_folder.manifest import read_manifest
 
 _log = logging.getLogger(__name__)
 
-NEXT: Final = "calibrate again, or add --accept-calibration to use it all the same"
+NEXT: Final = "calibrate again, or add `accept_calibration=True` to use it all the same"
 
 
 @dataclass(frozen=True, slots=True)

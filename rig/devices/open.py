@@ -1,6 +1,6 @@
 """Opens all devices of a rig together, lists every failure at once, and closes them gate first, whatever happens.
 
-It also checks that the user consents to light (`--arm`), as a real laser or gate requires; a simulated one does not.
+It also checks that the user consents to light (`arm`), as a real laser or gate requires; a simulated one does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -249,4 +249,4 @@ def light_problems(config: RigConfig, arm: bool) -> list[str]:
     if arm or not real:
         return []
     kinds = ", ".join(f"{slot} {devices[slot].kind}" for slot in real)
-    return [f"{config.name} has real light ({kinds}); clear the beam path, then add --arm"]
+    return [f"{config.name} has real light ({kinds}); clear the beam path, then add `arm=True`"]

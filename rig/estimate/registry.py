@@ -171,7 +171,7 @@ class RecalledMaps(Recalled):
 
     @property
     def _many(self) -> ManyMaps:
-        assert isinstance(self._of, ManyMaps), "it is `joint`"
+        assert isinstance(self._of, ManyMaps), "it is joint"
         return self._of
 
     def most_at_once(self, geometry: "SweepGeometry") -> int:

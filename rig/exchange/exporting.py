@@ -69,7 +69,7 @@ def export_run(
         except OSError as error:
             raise UsageError(
                 f"cannot export {run} to {target}: {error.strerror or error}; free the space it needs or name another "
-                "folder with --out"
+                "folder as `out`"
             ) from error
         files = tuple(sorted(file.name for file in folder.place("").iterdir()))
         log = export.log
@@ -132,7 +132,7 @@ class _Export:
         summed = self._asked.frames_per_picture or FRAMES_PER_PICTURE
         self.n_frames = summed * write(pictures.frame_pictures(self._blocks(), summed), view)
         if self.n_frames == 0:
-            raise UsageError(f"{self._run} holds fewer than {summed} frames, one picture's; lower --frames")
+            raise UsageError(f"{self._run} holds fewer than {summed} frames, one picture's; lower `frames_per_picture`")
 
     @property
     def _recorded(self) -> bool:
@@ -174,7 +174,9 @@ class _Export:
             what = f"no {view}" if view else "nothing to show"
             raise UsageError(f"{self._run} holds {what}; {self._make_maps()}")
         if self._asked.frames_per_picture and view != "frames":
-            raise UsageError(f"pictures of {view} sum no frames; name --view frames, or leave --frames out")
+            raise UsageError(
+                f"pictures of {view} sum no frames; name `view='frames'`, or leave `frames_per_picture` out"
+            )
         return view
 
     def _make_maps(self) -> str:
@@ -194,9 +196,12 @@ def _check(run: Path, kind: str, request: ExportRequest) -> None:
         (not run.exists(), f"{run} does not exist; name the folder of a run"),
         (view not in (None, *VIEWS), f"view {view!r} is unknown; choose one of {', '.join(VIEWS)}"),
         (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
-        (summed is not None and no_pictures, f"--frames {summed} are summed for pictures, {no_pictures}"),
+        (summed is not None and no_pictures, f"`frames_per_picture={summed}` are summed for pictures, {no_pictures}"),
         (summed is not None and summed < 1, f"{summed} frames make no picture; sum at least 1"),
-        (per_s is not None and no_film, f"--fps {fps} is of a film, {kind} is none; export mp4, or leave it out"),
+        (
+            per_s is not None and no_film,
+            f"`pictures_per_s={fps}` is of a film, {kind} is none; export mp4, or leave it out",
+        ),
         (
             per_s is not None and not 0 < per_s <= 1000,
             f"a film of {fps} pictures a second; choose 1000 or less, above 0",

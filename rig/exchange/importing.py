@@ -35,7 +35,7 @@ from rig.scan.run import versions
 
 
 class _Kind(NamedTuple):
-    """A kind of foreign files. forms: names for --form. upright_deg: the turn that makes their frames upright."""
+    """A kind of foreign files. forms: names for `form`. upright_deg: the turn that makes their frames upright."""
 
     suffix: str
     forms: tuple[str, ...]
@@ -102,7 +102,7 @@ def import_frames(
     if turn and (foreign.width % 8 or foreign.height % 8):
         raise UsageError(
             f"frames of {foreign.width} x {foreign.height} pixels cannot be turned, sizes that are no multiples of 8 "
-            "stay as they are; import with --rotate 0"
+            "stay as they are; import with `turn_deg=0`"
         )
     rate = foreign.frame_rate if given is None else given
     if rate is not None and not _MIN_RATE_HZ <= rate <= _MAX_TICK_HZ:
@@ -117,7 +117,7 @@ def import_frames(
         if expected > free:
             raise UsageError(
                 f"the recording will take {digits(expected / 1e9)} GB, the disk of {scratch.parent} has "
-                f"{digits(free / 1e9)} GB free; free some or name a folder on another disk with --out"
+                f"{digits(free / 1e9)} GB free; free some or name a folder on another disk as `out`"
             )
         with closing(Recording(scratch, expected_bytes=expected)) as recording:
             done, told = 0, counted("reading", "frames", progress)
@@ -160,9 +160,9 @@ def _checked_turn(kind: str, request: ImportRequest) -> QuarterTurn:
     turn = _KINDS[kind].upright_deg if request.turn_deg is None else request.turn_deg
     has_rows, stated = kind == "pi-imaging", rows is not None
     checks = [
-        (form not in (None, *forms), f"{kind} has no form {form!r}; choose {' or '.join(forms)}, or leave --form out"),
+        (form not in (None, *forms), f"{kind} has no form {form!r}; choose {' or '.join(forms)}, or leave `form` out"),
         (turn not in turns, f"frames cannot be turned by {turn} degrees; choose one of {', '.join(map(str, turns))}"),
-        (stated and not has_rows, f"rows is {rows}, but {kind} files say their size themselves; leave --rows out"),
+        (stated and not has_rows, f"rows is {rows}, but {kind} files say their size themselves; leave `rows` out"),
         (has_rows and rows not in (None, 512, 1024), f"rows is {rows}; a SPAD512S has 512, its 1M flavour 1024"),
     ]
     if problems := [line for wrong, line in checks if wrong]:

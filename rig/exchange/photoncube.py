@@ -82,7 +82,7 @@ def _open(file: Path, *, packed: bool) -> _Cube:
     if not (packed or beside) and holds_bits(loaded):
         raise UsageError(
             f"{file} of shape {loaded.shape} holds the bytes 0 and 1 only, as frames that are not packed do; pack them "
-            f"with {PACK}, or, where they are packed, import with --form packed"
+            f"with {PACK}, or, where they are packed, import with `form='packed'`"
         )
     return _Cube(loaded, width, _frame_rate(beside), _ranges(beside, len(loaded)))
 

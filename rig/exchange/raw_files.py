@@ -73,7 +73,7 @@ def _open_pi_imaging(file: Path, form: str | None, rows: int) -> tuple[str, NDAr
     listed = content[: len(content) - len(DONE)] if ended else content
     is_sparse = _is_list(listed, rows * COLUMNS)
     if form is None and is_packed and is_sparse:
-        raise UsageError(f"{file} can be read as packed frames and as a sparse list; say which with --form")
+        raise UsageError(f"{file} can be read as packed frames and as a sparse list; say which with `form`")
     if is_packed and form != "sparse":
         return "packed", packed
     if is_sparse and form != "packed":
@@ -139,7 +139,7 @@ def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrame
     if not full and _alternates(contents[0]):
         hints.append(
             f"every second frame of {files[0].name} shows something else, as full frames do that are read as halves; "
-            "if the whole array was read out, import with --form full"
+            "if the whole array was read out, import with `form='full'`"
         )
     n_frames = sum(len(content) for content in contents) // frame_bytes
     return ForeignFrames(COLUMNS, rows, n_frames, chunks, {"form": "full" if full else "half"}, hints=hints)

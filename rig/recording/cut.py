@@ -78,7 +78,7 @@ def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **chang
         except OSError as error:
             raise RecordingError(
                 f"cannot copy {error.filename} to {out}: {error.strerror or error}; free the space it needs or name "
-                "another --out"
+                "another `out`"
             ) from error
         target.write_json(MANIFEST, content)
         target.publish()
@@ -86,18 +86,18 @@ def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **chang
 
 
 def _parts(recording: RunRecording, spans: Sequence[MapSpan], asked: CutRequest) -> list[Part]:
-    ways = {"--maps": asked.maps, "--frames": asked.frames, "--time": asked.time}
+    ways = {"`maps`": asked.maps, "`frames`": asked.frames, "`time`": asked.time}
     given = [(name, text) for name, text in ways.items() if text is not None]
     if len(given) != 1:
         raise UsageError(f"say what to cut by exactly one of {', '.join(ways)}; {len(given)} were given")
     run = asked.start
     if not 0 <= run < len(recording.runs):
-        raise UsageError(f"--start {run} is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
+        raise UsageError(f"`start={run}` is not in {recording.path}; it has {len(recording.runs)}, counted from 0")
     of = recording.runs[run]
     name, text = given[0]
-    if name == "--maps":
+    if name == "`maps`":
         return _map_parts(recording, spans, *_range(name, text, 0, len(spans)))
-    first, end = _range(name, text, of.first_frame, of.end_frame) if name == "--frames" else _time_range(text, of)
+    first, end = _range(name, text, of.first_frame, of.end_frame) if name == "`frames`" else _time_range(text, of)
     first, end = max(first, of.first_frame), min(end, of.end_frame)
     if first >= end:
         raise UsageError(
@@ -113,7 +113,7 @@ def _map_parts(recording: RunRecording, spans: Sequence[MapSpan], first: int, en
     if not any(run.entries["sweep"].any() for run in recording.runs):
         raise UsageError(
             f"{recording.path} has no markers to tell maps apart (sweeps are found by the light of a whole run, if at "
-            "all); cut it with --frames or --time"
+            "all); cut it with `frames` or `time`"
         )
     if not 0 <= first < end <= len(spans):
         raise UsageError(f"maps {first}:{end} are not all in {recording.path}; it has {len(spans)}, counted from 0")
@@ -141,7 +141,7 @@ def _time_range(text: str, of: RecordedRun) -> tuple[int, int]:
         if not all(math.isfinite(one) for one in (first_s, end_s) if one is not None):
             raise ValueError(text)
     except ValueError:
-        raise UsageError(f"--time {text!r} is no range; write seconds from the first frame, as 0.5:1.25") from None
+        raise UsageError(f"`time` {text!r} is no range; write seconds from the first frame, as 0.5:1.25") from None
     first = of.first_frame if first_s is None else of.frame_at(first_s)
     return first, of.end_frame if end_s is None else of.frame_at(end_s)
 

@@ -50,7 +50,7 @@ def require_recording(path: Path) -> None:
 
 def _instead(path: Path) -> str:
     """Say what a path without a recording is, and what to do next."""
-    name_one = "name the folder of a run taken with --record"
+    name_one = "name the folder of a run taken with `record`"
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
     if not path.exists():

@@ -162,7 +162,8 @@ class ReplayFacts:
             of_it = f" ({lost} frames of it are gone)" if lost else ""
             raise UsageError(f"{spad.recording.path} holds no whole sweep{of_it}, so there is no map to be made of it")
         if maps is not None and maps > there and not spad.loops:
-            raise UsageError(f"--maps is {maps}, {spad.recording.path} holds {there}; ask for fewer, or add --loop")
+            holds = f"{spad.recording.path} holds {there}"
+            raise UsageError(f"`maps` is {maps}, {holds}; ask for fewer, or add `loop=True`")
         self.maps: int = maps or (ENDLESS if spad.loops else there)
         self.starts = itertools.cycle(self._played) if spad.loops else iter(self._played)
         learned = _part_learned(spad.recording.path, manifest, estimate, model)

@@ -191,8 +191,8 @@ class Space:
         if self.recording_bytes + self.map_bytes > self.free_bytes:
             raise UsageError(
                 f"the recording will take at most {_gb(self.recording_bytes)} and the maps {_gb(self.map_bytes)}, the "
-                f"disk of {self.folder} has {_gb(self.free_bytes)} free; free some, name a folder on another disk with "
-                "--out, or lower --maps"
+                f"disk of {self.folder} has {_gb(self.free_bytes)} free; free some, name a folder on another disk as "
+                "`out`, or lower `maps`"
             )
 
     def content(self) -> dict[str, Any]:

@@ -263,7 +263,7 @@ class Recording:
         name = self.files[-1] if self.files else segment_name(0)
         return RecordingError(
             f"cannot write the recording {name} beyond {self.bytes / 1e6:.0f} MB: {_reason(error)}; "
-            "free the space it needs or name a folder on another disk with --out"
+            "free the space it needs or name a folder on another disk as `out`"
         )
 
 

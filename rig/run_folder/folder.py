@@ -183,9 +183,9 @@ class RunFolder:
     def _claim(self) -> Path:
         there = self.path.exists()
         if there and not self.path.is_dir():
-            raise UsageError(f"--out {self.path} is a file; name a new folder")
+            raise UsageError(f"`out={self.path}` is a file; name a new folder")
         if there and any(self.path.iterdir()):
-            raise UsageError(f"--out {self.path} exists and is not empty; name a new folder or empty this one")
+            raise UsageError(f"`out={self.path}` exists and is not empty; name a new folder or empty this one")
         missing = [folder for folder in self.path.parents if not folder.exists()]
         for folder in [*reversed(missing), *([self.path] if self._in_place and not there else ())]:
             folder.mkdir()
@@ -219,7 +219,7 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
-    """The maps of a run that are written (`--save`). step: maps 0, step, 2 step, ...; None: only the last."""
+    """The maps of a run that are written (`save`). step: maps 0, step, 2 step, ...; None: only the last."""
 
     step: int | None = 1
 
@@ -228,7 +228,7 @@ class SavePolicy:
         """Parse "all", "last" or "every 5", also "every=5" or "every:5". Raises UsageError for anything else."""
         match = re.fullmatch(r"(all)|(last)|every[\s:=]+0*([1-9]\d*)", text.strip().lower(), re.ASCII)
         if match is None:
-            raise UsageError(f"--save is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
+            raise UsageError(f"`save` is {text!r}; write 'all', 'last' or 'every N' with N of 1 or more")
         return cls(None if match[2] else int(match[3] or 1))
 
     def count(self, maps: int) -> int:
@@ -272,7 +272,7 @@ def _plain(value: Any) -> Any:
 
 def _unwritable(path: Path, error: OSError) -> UsageError:
     reason = error.strerror or str(error)
-    return UsageError(f"cannot write {path}: {reason}; name another folder with --out or free the space it needs")
+    return UsageError(f"cannot write {path}: {reason}; name another folder as `out` or free the space it needs")
 
 
 def write_learned(file: Path, state: Learned) -> None:

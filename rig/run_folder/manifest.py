@@ -201,8 +201,7 @@ def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
         raise DamagedRecordingError("\n".join(f"{line}; take it from a copy of the recording" for line in problems))
     if "passes" in manifest:
         raise UsageError(
-            f"{folder} was scanned with --adaptive, in passes that this version cannot put together; "
-            "scan again without it"
+            f"{folder} was scanned adaptively, in passes that this version cannot put together; scan again"
         )
 
 

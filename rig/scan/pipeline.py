@@ -115,7 +115,7 @@ class Pipeline:
         if recorder is not None and not recorder.thread.join(DRAIN_S):
             return RecordingError(
                 f"the disk did not take what was left in the ring within {DRAIN_S:g} s; name a folder on another disk "
-                "with --out"
+                "as `out`"
             )
         if recorder is not None and recorder.error is not None:
             return recorder.error
@@ -148,7 +148,7 @@ MOST_SLOTS = 1024
 
 
 class Overload(StrEnum):
-    """Policy for blocks that find no room in the ring (`--on-overload`)."""
+    """Policy for blocks that find no room in the ring (`on_overload`)."""
 
     ABORT = "abort"
     """Lose nothing: a source that can wait waits, one that cannot ends the run."""
@@ -163,14 +163,14 @@ class Overload(StrEnum):
         try:
             return cls(text)
         except ValueError:
-            raise UsageError(f"--on-overload is {text!r}; write 'abort', 'drop' or 'block'") from None
+            raise UsageError(f"`on_overload` is {text!r}; write 'abort', 'drop' or 'block'") from None
 
 
 def require_policy(policy: Overload, info: SpadInfo) -> None:
     """Raise UsageError if the policy is BLOCK and the SPAD cannot wait."""
     if policy is Overload.BLOCK and not info.can_wait:
         raise UsageError(
-            f"--on-overload is 'block', but the {info.model} SPAD cannot wait while it exposes; "
+            f"`on_overload` is 'block', but the {info.model} SPAD cannot wait while it exposes; "
             "choose 'abort' to lose no frame or 'drop' to go on without those lost"
         )
 

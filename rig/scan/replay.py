@@ -51,7 +51,7 @@ def play(
             tap = TapFile.begin(Path(folder) / CONTROL_FILE)
         try:
             with open_rig(config, tap=tap) as rig:
-                assert isinstance(rig.spad, ReplaySpad), "as `replay_config` says"
+                assert isinstance(rig.spad, ReplaySpad), "replay_config says so"
                 compared = compared and _asks_for_the_same(rig.spad.recording, request.maps)
                 pace = rig.spad.pace
                 if steps is not None:

@@ -126,7 +126,7 @@ class Run:
                 if file.is_file() and file.name != CONTROL_FILE
             }
         except OSError as error:
-            raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another --out") from error
+            raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another `out`") from error
         sync = None if self._tap is None else self._tap.sync
         expected = space.recording_bytes
         self._recording = Recording(folder.path, expected_bytes=expected, on_begin=begun, on_sync=sync)

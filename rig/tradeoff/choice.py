@@ -50,7 +50,7 @@ class Choice:
         if self.fits:
             return f"for {self.wish}: {self.setting}: {self.figures}"
         nearest = f"{self.setting}: {self.figures}"
-        return f"nothing tried gives {self.wish}; nearest is {nearest}; try other --exposures or --estimators"
+        return f"nothing tried gives {self.wish}; nearest is {nearest}; try other exposures or estimators"
 
     @property
     def figures(self) -> str:
@@ -72,21 +72,21 @@ def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):
-        problems.append(f"--of is {of!r}; the time is that of sensor or compute")
+        problems.append(f"`of` is {of!r}; the time is that of sensor or compute")
     if time_budget is not None and error is not None:
-        problems.append("--time-budget and --error ask for two things; give one of them")
+        problems.append("`time_budget` and `error` ask for two things; give one of them")
     if time_budget is not None:
         try:
             time_ms = 1e3 * parse_quantity(time_budget, "time")
         except ValueError as wrong:
-            problems.append(f"--time-budget {wrong}")
+            problems.append(f"`time_budget` {wrong}")
     if error is not None:
         match = _PIXELS.fullmatch(error)
         if match is None:
-            problems.append(f"--error {error!r} is no number of pixels; write e.g. '0.1 px'")
+            problems.append(f"`error` {error!r} is no number of pixels; write e.g. '0.1 px'")
         else:
             error_px = float(match[1])
-    for name, text, value in (("--time-budget", time_budget, time_ms), ("--error", error, error_px)):
+    for name, text, value in (("`time_budget`", time_budget, time_ms), ("`error`", error, error_px)):
         if value is not None and value <= 0:
             problems.append(f"{name} is {text}; it must be more than 0")
     if problems:
@@ -133,7 +133,7 @@ def advice(rows: Sequence[TradeoffRow], wish: Wish | None, answer: Choice | None
         return f"take {answer.setting}: {answer.figures}, the best for {wish}" if answer.fits else str(answer)
     least = choose(rows, Wish(error_px=0.0))
     if least is None:
-        return "no setting can be named: every one leaves more than 5 % of the answers out; raise --exposures"
+        return "no setting can be named: every one leaves more than 5 % of the answers out; raise exposures"
     found = choose(rows, Wish(error_px=WORTH * least.mean_abs_px))
     assert found is not None, "the one with the least error fits"
     why = f"the shortest scan within {WORTH:g} times the least error, {digits(least.mean_abs_px)} px"

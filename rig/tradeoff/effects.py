@@ -134,7 +134,7 @@ def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int |
     are off. The parts add up to the total. Raises UsageError for a row or column that does not exist.
     """
     if row is None or column is None:
-        raise UsageError("the flux is that of one image row at one column of the scan; give both --row and --column")
+        raise UsageError("the flux is that of one image row at one column of the scan; give both `row` and `column`")
     config = configure(config, scene=scene)
     scan = config.scan
     with open_world(config) as (world, power_w):

@@ -32,7 +32,7 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
     if setting is not None:
         comments = [f"rig tradeoff: {done.answer}"]
         if done.accepted_calibration:
-            comments.append("its calibration was accepted all the same: scan with --accept-calibration")
+            comments.append("its calibration was accepted all the same: scan with accept_calibration")
         head = "".join(f"# {comment}\n" for comment in comments)
         folder.write_text(
             SETTING_FILE, head + yaml.safe_dump(portable_content(setting), sort_keys=False, allow_unicode=True)

@@ -196,5 +196,5 @@ def require_plan(config: RigConfig) -> None:
         most = int(plan.exposures * MOST_KEPT_BYTES / kept)
         raise UsageError(
             f"{plan.exposures} exposures make {kept / 1e9:.3g} GB of frames a sweep, at most "
-            f"{MOST_KEPT_BYTES / 1e9:g} GB are kept for all estimators; leave out --exposures above {most}"
+            f"{MOST_KEPT_BYTES / 1e9:g} GB are kept for all estimators; leave out `exposures` above {most}"
         )

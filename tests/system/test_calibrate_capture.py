@@ -106,7 +106,7 @@ def test_a_picture_without_a_board_is_kept_with_the_reason():
 def test_rigs_of_several_lines_and_real_light_are_refused():
     with pytest.raises(UsageError, match="4 lines"):
         capture_view(configure("simulated-4-lines"), "000", None)
-    with pytest.raises(UsageError, match="--arm"):
+    with pytest.raises(UsageError, match="`arm=True`"):
         capture_view(configure("lab"), "000", None)
 
 

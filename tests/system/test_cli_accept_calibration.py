@@ -52,4 +52,4 @@ def test_a_tradeoff_asks_for_it_as_the_scan_of_its_answer_will(rig: Rig, foreign
     assert "calibration accepted in spite of other-spad" in accepted.out
     (noted,) = json.loads(Path("tried/tradeoff.json").read_text())["accepted_calibration"]
     assert noted.startswith("other-spad: ")
-    assert "scan with --accept-calibration" in Path("tried/setting.yaml").read_text()
+    assert "scan with accept_calibration" in Path("tried/setting.yaml").read_text()

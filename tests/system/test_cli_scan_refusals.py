@@ -57,7 +57,7 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     ("arguments", "said"),
     [
         (["--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
-        (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example '--exposures 10'"),
+        (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example --exposures 10"),
         (["--exposures", "many"], "write a whole number or see 'rig scan --help'"),
         (["--min-confidence", "high"], "write a number or see 'rig scan --help'"),
         (["--maps", "0"], "maps is 0; it must be at least 1"),

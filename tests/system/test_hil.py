@@ -128,5 +128,5 @@ def test_no_light_is_let_out_without_a_word(taken: Path) -> None:
     content["sync"]["port"] = "/dev/ttyACM0"
     file = taken.parent / "real.yaml"
     file.write_text(yaml.safe_dump(content))
-    with pytest.raises(UsageError, match="--arm"):
+    with pytest.raises(UsageError, match="`arm=True`"):
         api.replay(taken, config=file)

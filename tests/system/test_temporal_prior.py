@@ -36,7 +36,7 @@ def test_a_part_gives_the_maps_of_the_whole_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_it_is_for_joint(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--temporal-prior is for the estimator joint, this is argmax"):
+    with pytest.raises(UsageError, match="`temporal_prior` is for the estimator joint, this is argmax"):
         api.configure(write_rig(tmp_path), temporal_prior=True)
     with_prior = api.configure(write_rig(tmp_path), estimator="joint", temporal_prior=True)
     with pytest.raises(UsageError, match=r"estimate.temporal_prior is for the estimator joint, this is likelihood"):

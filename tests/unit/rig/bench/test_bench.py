@@ -208,7 +208,7 @@ def test_what_cannot_be_asked_for_is_refused():
             api.soak(threads=threads)
     with pytest.raises(UsageError, match="more than 0 s"):
         api.soak(seconds=0)
-    with pytest.raises(UsageError, match="on-overload"):
+    with pytest.raises(UsageError, match="`on_overload`"):
         api.soak(seconds=1, on_overload="wait")
 
 

@@ -75,7 +75,7 @@ def test_a_view_that_the_camera_was_made_of_is_refused_before_the_next_is_shown(
     first, second, *_ = shown(monkeypatch)[0].views
     told: list[str] = []
     monkeypatch.setattr(Session, "say", lambda self, line: told.append(line))
-    with pytest.raises(UsageError, match=r"001 holds a view that the camera was made of; .* another --seed"):
+    with pytest.raises(UsageError, match=r"001 holds a view that the camera was made of; .* another `seed`"):
         shown(monkeypatch, of_camera={corners_digest(second)})
     assert len(told) == 1
     with pytest.raises(UsageError, match="000 holds a view that the camera"):

@@ -117,7 +117,7 @@ def test_a_foreign_or_stale_calibration_is_refused_and_can_be_accepted(
         with pytest.raises(UsageError, match=says) as refused:
             call(rig, out=tmp_path / "none")
     (problem,) = refused.value.problems
-    assert problem.endswith("calibrate again, or add --accept-calibration to use it all the same")
+    assert problem.endswith("calibrate again, or add `accept_calibration=True` to use it all the same")
     assert "made.yaml" in problem
     assert not (tmp_path / "none").exists()
     result = api.scan(rig, out=tmp_path / "run", accept_calibration=True)
@@ -143,7 +143,7 @@ def test_a_simulated_rig_is_told_by_what_its_geometry_holds_and_not_by_its_file_
     moved = text.replace("-0.3", "-0.28")
     assert moved != text
     geometry.write_text(moved)
-    said = r"made.yaml: is of the rig 'small' with world 'rig.yaml \(\w{16}\)', this rig has 'rig.yaml .*--accept-cal"
+    said = r"made.yaml: is of the rig 'small' with world 'rig.yaml \(\w{16}\)', this rig has 'rig.yaml .*`accept_cal"
     with pytest.raises(UsageError, match=said):
         api.plan_scan(rig)
     api.plan_scan(rig, accept_calibration=True)

@@ -231,7 +231,7 @@ def test_runs_of_two_sizes_make_no_array(tmp_path: Path) -> None:
         ("png", {"frames_per_picture": 0}, "at least 1"),
         ("png", {"pictures_per_s": 5.0}, "png is none; export mp4"),
         ("ply", {"frames_per_picture": 5}, "ply has none; export png or mp4"),
-        ("png", {"frames_per_picture": 5}, "depth sum no frames; name --view frames"),
+        ("png", {"frames_per_picture": 5}, "depth sum no frames; name `view='frames'`"),
     ],
 )
 def test_what_a_run_has_not_is_refused(mapped: Path, kind: str, options: dict[str, Any], why: str) -> None:
@@ -243,5 +243,5 @@ def test_a_run_that_only_recorded_says_how_to_get_maps(run: Path, tmp_path: Path
     with pytest.raises(UsageError, match="rig reconstruct"):
         export_run(run, "ply", out=tmp_path / "out")
     assert export_run(run, "png", out=tmp_path / "png", frames_per_picture=50).files[0] == "frames-000000.png"
-    with pytest.raises(UsageError, match="--frames"):
+    with pytest.raises(UsageError, match="lower `frames_per_picture`"):
         export_run(run, "mp4", out=tmp_path / "film", frames_per_picture=10**6)

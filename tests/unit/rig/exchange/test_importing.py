@@ -81,7 +81,7 @@ def test_a_file_that_could_be_either_is_asked_about(tmp_path: Path) -> None:
     dark = np.zeros((1, 512, 512), bool)
     dark[0, 511, 512 - 32 + 21] = True  # the last four bytes read 262144, little-endian
     (tmp_path / "dark.bin").write_bytes(pi_packed(dark))
-    with pytest.raises(UsageError, match="--form"):
+    with pytest.raises(UsageError, match="`form`"):
         import_frames("pi-imaging", [tmp_path / "dark.bin"], tmp_path / "run")
     import_frames("pi-imaging", [tmp_path / "dark.bin"], tmp_path / "run", form="packed", turn_deg=0)
     assert np.array_equal(frames_of(tmp_path / "run"), dark)
@@ -219,10 +219,10 @@ def test_every_file_that_was_cut_off_is_named(tmp_path: Path, kind: str) -> None
     ("kind", "options", "why"),
     [
         ("tiff", {}, "choose one of pi-imaging"),
-        ("photoncube", {"form": "half"}, "leave --form out"),
+        ("photoncube", {"form": "half"}, "leave `form` out"),
         ("swissspad2", {"form": "sparse"}, "half or full"),
         ("swissspad2", {"turn_deg": 45}, "45 degrees"),
-        ("swissspad2", {"rows": 512}, "leave --rows out"),
+        ("swissspad2", {"rows": 512}, "leave `rows` out"),
         ("pi-imaging", {"rows": 600}, "1024"),
         ("pi-imaging", {"frame_rate": "100"}, "no unit"),
     ],
@@ -234,7 +234,7 @@ def test_options_that_cannot_be_are_refused(tmp_path: Path, kind: str, options: 
 
 def test_a_cube_that_looks_unpacked_is_refused_until_it_is_said_to_be_packed(tmp_path: Path) -> None:
     frames = some_frames(40, 6, 16)
-    with pytest.raises(UsageError, match=r"0 and 1 only.*numpy\.packbits\(frames, axis=2\).*--form packed"):
+    with pytest.raises(UsageError, match=r"0 and 1 only.*numpy\.packbits\(frames, axis=2\).*`form='packed'`"):
         import_cube(tmp_path, frames.astype(np.uint8))
     assert not (tmp_path / "run").exists()
     result = import_cube(tmp_path, frames.astype(np.uint8), form="packed")

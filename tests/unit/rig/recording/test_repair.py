@@ -233,7 +233,7 @@ def test_a_run_that_is_still_recording_is_not_repaired(tmp_path: Path, runs: Run
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ([], "is an empty folder: no frames-*.spb; name the folder of a run taken with --record"),
+        ([], "is an empty folder: no frames-*.spb; name the folder of a run taken with `record`"),
         (["a/notes.txt"], "is a folder without a recording: no frames-*.spb; name"),
         (["frames.npy"], "no frames-*.spb, but .npy files; if these are frames, 'rig import photoncube"),
         (["RAW00000.bin"], "'rig import swissspad2 (or pi-imaging)"),

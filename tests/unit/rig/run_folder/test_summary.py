@@ -88,4 +88,4 @@ def test_real_light_needs_arming() -> None:
     assert light_problems(config("obis", "prawndo"), arm=True) == []
     (problem,) = light_problems(config("obis", "simulated"), arm=False)
     assert "laser obis" in problem
-    assert "--arm" in problem
+    assert "`arm=True`" in problem
