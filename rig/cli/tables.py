@@ -162,7 +162,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         *(() if summary.stages is None else (("stages", _stages(summary.stages)),)),
         *(() if summary.replay is None or not summary.replay.blocks else (("clock", _clock(summary.replay)),)),
         *(("calibration", f"accepted in spite of {reason}") for reason in summary.accepted_calibration),
-        ("filled", f"{_percent(summary.valid_fraction)} of the pixels have a depth"),
+        ("filled", _filled(summary)),
     ]
     fog = summary.fog
     if fog.extinction_per_m is not None:
@@ -221,6 +221,11 @@ def _number(value: float | None, count: int = 3) -> str:
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{value:.1%}"
+
+
+def _filled(summary: Summary) -> str:
+    left_out = f"; {summary.floating_points:.0f} that float are left out" if summary.floating_points else ""
+    return f"{_percent(summary.valid_fraction)} of the pixels have a depth{left_out}"
 
 
 WIDTH = 80

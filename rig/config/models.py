@@ -170,6 +170,9 @@ class EstimateConfig(ConfigSection):
     min_confidence: float = Field(
         default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
     )
+    keep_floating: bool = Field(
+        default=False, description="keep points of the depth map that float between two surfaces", examples=["true"]
+    )
     temporal_prior: bool = Field(
         default=False,
         description="hold each map to the last one a little, for scenes that mostly stand still; joint only",

@@ -15,6 +15,7 @@ from rig.config.models import EstimateConfig
 from rig.count.map_checks import MapChecks
 from rig.count.volume import Counter, FrameTally, LineCounter, SweepLayout
 from rig.depth.depth import depth_map, share_claims
+from rig.depth.floating import without_floating
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
 from rig.estimate.registry import COUPLED, LEARNING, Learned, ManyMaps, create_estimator, recalling
@@ -30,7 +31,8 @@ class MapResult:
     """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
 
     compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
-    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`).
+    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`). floating:
+    number of points left out because they float between two surfaces; None if such points are kept, or without depth.
     """
 
     stripe: StripeTable
@@ -40,6 +42,7 @@ class MapResult:
     compute_s: float
     learned: Learned | None = None
     doubts: tuple[str, ...] = ()
+    floating: int | None = None
 
 
 def map_geometry(
@@ -110,6 +113,7 @@ class Reconstructor:
         self._model = model
         self._commands = np.asarray(column_commands, dtype=np.float64)
         self._min_confidence = estimate.min_confidence
+        self._keep_floating = estimate.keep_floating
         self._filter = estimate.filter
         self._coupled = estimate.estimator in COUPLED
         self._lines = lines
@@ -175,7 +179,7 @@ class Reconstructor:
         return MapUnderWay(complete, partial(self.estimator.end, work))
 
     def complete(self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float) -> MapResult:
-        """Make the map of a sweep from its stripe table: filter, depth, intensity, fog and doubts.
+        """Make the map of a sweep from its stripe table: filter, depth without floating points, intensity, fog, doubts.
 
         estimate_s: the time that the estimator took for the table."""
         return self.completed(stripe, sweep, filter, estimate_s, self.estimator.used, self._workers)
@@ -194,12 +198,15 @@ class Reconstructor:
             from rig.estimate.median import median_filter
 
             stripe = median_filter(stripe, geometry.reference_px(), coupled=self._coupled)
+        floating: int | None = None
         if self._model is None:
             depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
         else:
             depth = depth_map(stripe, geometry, self._min_confidence, workers)
+            if not self._keep_floating:
+                depth, floating = without_floating(depth, geometry.px_per_inverse_depth(), workers)
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, intensity, fog, compute_s, used, doubts)
+        return MapResult(stripe, depth, intensity, fog, compute_s, used, doubts, floating)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes at which the frames of each column were actually taken."""

@@ -90,16 +90,32 @@ class SweepGeometry:
         """
         near_m, far_m = self.depth_range_m
         w = 0.5 * (1.0 / near_m + 1.0 / far_m)
-        fullest = int(np.isfinite(self.u).sum(axis=1).argmax())
-        valid = np.flatnonzero(np.isfinite(self.u[fullest]))
-        if len(valid) < 2:
+        left, right, u_left, px_per_tangent = self._scale()
+        if not px_per_tangent:
             return np.zeros((self.rows, self.columns))
-        left, right = int(valid[0]), int(valid[-1])
-        u_left = float(self.u[fullest, left])
-        px_per_tangent = (right - left) / (float(self.u[fullest, right]) - u_left)
         row = np.nan_to_num(self.v[:, (left + right) // 2].astype(np.float64))
         u = (w - self.plane[None, :, 2] - self.plane[None, :, 1] * row[:, None]) / self.plane[None, :, 0]
         return np.asarray(left + px_per_tangent * (u - u_left))
+
+    def px_per_inverse_depth(self) -> float:
+        """How many px a stripe moves along its row per 1/m of inverse depth, without sign: the median of the columns.
+
+        0 if no row has two pixels with a ray.
+        """
+        return float(np.median(np.abs(self._scale()[3] / self.plane[:, 0])))
+
+    def _scale(self) -> tuple[int, int, float, float]:
+        """First and last pixel with a ray on the row that has most, u at the first one, and px per unit of u.
+
+        The latter is 0 if no row has two such pixels.
+        """
+        fullest = int(np.isfinite(self.u).sum(axis=1).argmax())
+        valid = np.flatnonzero(np.isfinite(self.u[fullest]))
+        if len(valid) < 2:
+            return 0, 0, 0.0, 0.0
+        left, right = int(valid[0]), int(valid[-1])
+        u_left = float(self.u[fullest, left])
+        return left, right, u_left, (right - left) / (float(self.u[fullest, right]) - u_left)
 
 
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:

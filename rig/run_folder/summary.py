@@ -132,10 +132,12 @@ class TruthErrors:
 class Summary:
     """A run in figures. Times are in seconds, of the sensor or the computer. None means no value.
 
-    valid_fraction: share of camera pixels with depth, mean of the maps. fog: of the last map. verdict_reasons: reasons
-    against maps, found in the maps themselves. accepted_calibration: reasons against the calibration that the user
-    accepted. estimator_why: why the run chose this estimator; empty if it was named. learned: if a file for learned
-    states was named, whether the first map was estimated with the state in it, and why if not; else empty.
+    valid_fraction: share of camera pixels with depth, mean of the maps. floating_points: number of points left out of
+    a map because they float between two surfaces, mean of the maps; None if they are kept, or without depth. fog: of
+    the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons
+    against the calibration that the user accepted. estimator_why: why the run chose this estimator; empty if it was
+    named. learned: if a file for learned states was named, whether the first map was estimated with the state in it,
+    and why if not; else empty.
     """
 
     maps: int
@@ -149,6 +151,7 @@ class Summary:
     compute_time_s: float
     realtime_factor: float | None
     valid_fraction: float | None
+    floating_points: float | None
     fog: FogEstimate
     truth: TruthErrors | None
     verdict: RunVerdict
@@ -173,6 +176,7 @@ class Summary:
 class _OfMap(NamedTuple):
     compute_s: float
     valid: float
+    floating: int | None
     fog: FogEstimate
     errors: tuple[Errors, Errors] | None
     """Errors of stripe and depth; None if the truth is not known."""
@@ -212,7 +216,7 @@ class MapTally:
         if truth is not None:
             errors = stripe_errors(result.stripe.x_px, truth.x_px), depth_errors(result.depth_m, truth.depth_m)
         # In one step: with an interrupt the map is counted wholly or not at all.
-        self._maps.append(_OfMap(compute_s, valid, result.fog, errors, result.doubts))
+        self._maps.append(_OfMap(compute_s, valid, result.floating, result.fog, errors, result.doubts))
 
     def summary(
         self,
@@ -228,6 +232,7 @@ class MapTally:
         errors = [each.errors for each in self._maps if each.errors is not None]
         truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
         compute_s = sum(each.compute_s for each in self._maps)
+        floating = [each.floating for each in self._maps if each.floating is not None]
         return Summary(
             maps=self.maps,
             map_rate_hz=self.maps / sensor_time_s if sensor_time_s > 0 else None,
@@ -240,6 +245,7 @@ class MapTally:
             compute_time_s=compute_s,
             realtime_factor=sensor_time_s / compute_s if compute_s > 0 else None,
             valid_fraction=statistics.fmean(each.valid for each in self._maps) if self._maps else None,
+            floating_points=statistics.fmean(floating) if floating else None,
             fog=self._maps[-1].fog if self._maps else FogEstimate(),
             truth=truth,
             verdict=verdict,

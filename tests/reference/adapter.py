@@ -52,6 +52,13 @@ def reconstructor_of(
     return Reconstructor(model, commands, geometry, estimate, lines=lines)
 
 
+def depth_with_floating(reconstructor: Any, result: Any) -> NDArray[np.float32]:
+    """The depth map of a MapResult of this reconstructor before points that float were left out."""
+    from rig.depth.depth import depth_map
+
+    return np.asarray(depth_map(result.stripe, reconstructor.geometry, 0.5))
+
+
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:
     """One sweep of counts (columns, H, window) in the reconstructor's windows."""
     from rig.count.volume import CountVolume

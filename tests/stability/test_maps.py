@@ -50,6 +50,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
         return
     assert (geometry.rows, geometry.width, geometry.columns) == (5, width, len(rows))
     assert np.isfinite(geometry.reference_px()).all()
+    assert 0 <= geometry.px_per_inverse_depth() < np.inf
     assert geometry.window % 64 == 0
     assert np.all((geometry.x0 % 64 == 0) & (geometry.x0 >= 0))
     u, v = geometry.u.astype(float), geometry.v.astype(float)

@@ -32,7 +32,8 @@ def test_a_recording_gives_the_depth_of_its_scan_to_the_bit_alone(rig: Rig, smal
     assert again.code == 0, again.err
     assert_same(Path("elsewhere"), Path("again"))
     live, replayed = summary(Path("elsewhere")), summary(Path("again"))
-    for key in ("maps", "frames", "sensor_time_s", "valid_fraction", "fog", "truth", "verdict", "sync"):
+    same = "maps", "frames", "sensor_time_s", "valid_fraction", "floating_points", "fog", "truth", "verdict", "sync"
+    for key in same:
         assert live[key] == replayed[key], key
 
 

@@ -12,7 +12,7 @@ from tests.system.small_rig import HEIGHT, WIDTH
 
 KEYS = {
     "maps", "map_rate_hz", "columns", "exposures", "estimator", "filter", "frames", "sensor_time_s", "compute_time_s",
-    "realtime_factor", "valid_fraction", "fog", "truth", "verdict", "stages", "sync",
+    "realtime_factor", "valid_fraction", "floating_points", "fog", "truth", "verdict", "stages", "sync",
 }  # fmt: skip
 
 
@@ -81,3 +81,7 @@ def test_options_change_the_config_and_confidence_decides_what_enters_the_depth_
     )
     assert (sure["exposures"], sure["estimator"], sure["filter"]) == (2, "edge", "median")
     assert all_in["valid_fraction"] > sure["valid_fraction"]  # type: ignore[operator]
+    kept = strict(rig("scan", small, *options, "--min-confidence", 0, "--keep-floating").out)
+    assert kept["floating_points"] is None
+    assert all_in["floating_points"] >= 0  # type: ignore[operator]
+    assert kept["valid_fraction"] >= all_in["valid_fraction"]  # type: ignore[operator]

@@ -8,22 +8,25 @@ the places without a stripe, where every answer is wrong: calibration error, the
 the places without a stripe that have a confidence above 0.5, share of the answers with 0.9 and more, how many of these
 are right, and share of the right answers that a depth map takes (0.5). `floating`: of 100 000 answers that a depth map
 takes, those between two surfaces: true stripes up to 5 rows and columns away lie nearer and farther, and none within
-1.5 px.
+1.5 px. `points`: the same of the points of the depth map, by the true depth on the camera's pixels, before the points
+whose neighbours say that they float are left out; `left`: of those that stay; `right lost`: of 100 000 points that are
+right, those left out.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.reference.adapter import reconstructor_of, volume_of
-from tests.reference.geometry import Geometry
+from tests.reference.adapter import depth_with_floating, reconstructor_of, volume_of
+from tests.reference.geometry import BASELINE_M, FOCAL_PX, Geometry
 from tests.reference.scene import Scene
 from tests.reference.tables.accuracy import RIGS
-from tests.reference.tables.answers import Answers, calibration_error, pooled, reliability
+from tests.reference.tables.answers import WITHIN_PX, Answers, calibration_error, pooled, reliability
 from tests.reference.tables.printed import Table, parser_of, scenes_asked
 from tests.reference.working_point import POINTS, REPORT, WorkingPoint
 
@@ -31,11 +34,17 @@ SURE, TAKEN = 0.9, 0.5
 AROUND, SURFACE_PX = 5, 1.5
 TITLES = (
     "point", "K", "estimator", "mean px", "missing", "calibration error", "largest", "empty believed", "sure",
-    "of them right", "right taken", "floating", "claimed less right, by tenths",
+    "of them right", "right taken", "floating", "points", "left", "right lost", "claimed less right, by tenths",
 )  # fmt: skip
 
-_Seen = tuple[Answers, float]
-"""Answers of a map, and the share of those taken that float."""
+
+class _Seen(NamedTuple):
+    """Answers of a map, the share of those taken that float, and numbers of points of its depth map."""
+
+    answers: Answers
+    floats: float
+    points: NDArray[np.int64]
+    """All, floating and right ones, before and after floating ones are left out (2, 3)."""
 
 
 def answers_of(scene: Scene, point: str, exposures: int, estimators: Sequence[str], seed: int) -> list[_Seen]:
@@ -51,8 +60,17 @@ def answers_of(scene: Scene, point: str, exposures: int, estimators: Sequence[st
         result = maker.map(volume_of(maker, counts, exposures))
         x_px = np.where(result.stripe.confidence > TAKEN, result.stripe.x_px, np.nan)
         floats = float(floating(x_px - reference, world.x_true - reference).sum() / np.isfinite(x_px).sum())
-        seen.append((Answers.of(world, result, slice(None)), floats))
+        maps = depth_with_floating(maker, result), result.depth_m
+        points = np.array([_points(depth_m, scene.depth_m) for depth_m in maps])
+        seen.append(_Seen(Answers.of(world, result, slice(None)), floats, points))
     return seen
+
+
+def _points(depth_m: NDArray[np.float32], true_m: NDArray[np.float32]) -> tuple[int, int, int]:
+    """Number of points of a depth map, of those that float between true surfaces, and of those that are right."""
+    disparity, true = (FOCAL_PX * BASELINE_M / depth.astype(np.float64) for depth in (depth_m, true_m))
+    right = np.abs(disparity - true) <= WITHIN_PX
+    return int(np.isfinite(disparity).sum()), int(floating(disparity, true).sum()), int(right.sum())
 
 
 def floating(distance: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -71,16 +89,21 @@ def floating(distance: NDArray[np.float64], true: NDArray[np.float64]) -> NDArra
 
 def cells_of(seen: Sequence[_Seen]) -> list[str]:
     """The cells of a line, of what was seen in its scenes."""
-    scenes = [answers for answers, _ in seen]
+    scenes = [one.answers for one in seen]
     together = pooled(scenes)
     confidence, right = together.claims(empty=True)
     sure, empty = confidence >= SURE, together.confidence[~together.lit]
     tenths = reliability(confidence, right)
+    before, after = np.sum([one.points for one in seen], axis=0)
+    points, float_before, right_before = before
+    stay, float_after, right_after = after
     return [
         f"{together.mean_px:.3f}", f"{together.missing:.4f}", f"{calibration_error(confidence, right):.3f}",
         f"{max(calibration_error(*one.claims(empty=True)) for one in scenes):.3f}",
         f"{(empty > TAKEN).mean():.3f}", f"{sure.mean():.2f}", f"{right[sure].mean() if sure.any() else np.nan:.3f}",
-        f"{(confidence[right] > TAKEN).mean():.3f}", f"{1e5 * np.mean([floats for _, floats in seen]):.1f}",
+        f"{(confidence[right] > TAKEN).mean():.3f}", f"{1e5 * np.mean([one.floats for one in seen]):.1f}",
+        f"{1e5 * float_before / points:.1f}", f"{1e5 * float_after / stay:.1f}",
+        f"{1e5 * (right_before - right_after) / right_before:.2f}",
         " ".join(f"{100 * (claimed - found):+.0f}" for _, claimed, found in tenths),
     ]  # fmt: skip
 

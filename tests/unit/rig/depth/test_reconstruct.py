@@ -65,6 +65,17 @@ def test_a_higher_confidence_limit_only_takes_pixels_away():
     assert not (few & ~many).any()
 
 
+def test_floating_points_are_left_out_and_counted_unless_they_are_kept():
+    options = {"estimator": "argmax", "exposures": 3, "min_confidence": 0.0}
+    plain, kept = mapped(**options), mapped(**options, keep_floating=True)
+    out = np.isfinite(kept.depth_m) & np.isnan(plain.depth_m)
+    assert plain.floating == out.sum() > 0
+    assert kept.floating is None
+    np.testing.assert_array_equal(plain.depth_m, np.where(out, np.nan, kept.depth_m))
+    for name in ("x_px", "confidence"):
+        np.testing.assert_array_equal(getattr(plain.stripe, name), getattr(kept.stripe, name))
+
+
 def test_without_a_model_there_are_stripes_but_neither_depth_nor_fog():
     sweep, config = simulated(rows=16, columns=64), EstimateConfig(estimator="likelihood")
     geometry = map_geometry(None, np.arange(64), DEPTH_RANGE_M, sensor=(16, 512))

@@ -9,8 +9,8 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.errors import UsageError
 from rig.geometry.kernels import row_windows
-from rig.geometry.windows import MARGIN_PX, evenly_spread, sweep_geometry
-from tests.reference.geometry import Geometry
+from rig.geometry.windows import MARGIN_PX, evenly_spread, sweep_geometry, uncalibrated_geometry
+from tests.reference.geometry import BASELINE_M, FOCAL_PX, Geometry
 from tests.stability.inventory import covers
 from tests.unit.small_maps import RIGS, geometry_of, rig_model
 
@@ -101,6 +101,13 @@ def test_the_reference_line_is_that_of_a_wall_at_the_middle_inverse_depth():
     n, d = g.planes[:, :3], g.planes[:, 3]
     u = (w * d - n[:, 2] - n[:, 1] * v[:, None]) / n[:, 0]
     np.testing.assert_allclose(reference, 99.5 + g.focal_px * u, atol=1e-3)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_stripe_moves_by_focal_length_times_baseline_per_inverse_depth(side):
+    g = Geometry.build(width=200, height=9, columns=30, side=side)
+    assert geometry_of(g).px_per_inverse_depth() == pytest.approx(FOCAL_PX * BASELINE_M, rel=1e-5)
+    assert uncalibrated_geometry(4, 1, 3).px_per_inverse_depth() == 0
 
 
 def test_one_row_is_a_sensor_and_one_column_is_none():

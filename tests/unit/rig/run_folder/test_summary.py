@@ -1,5 +1,6 @@
 """The summary: what is averaged, what is left out, and what each verdict means."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -59,6 +60,16 @@ def test_nothing_known_is_null_and_no_truth_is_no_key() -> None:
     assert content["map_rate_hz"] is None
     assert content["realtime_factor"] is None
     assert content["valid_fraction"] is None
+
+
+def test_floating_points_are_a_mean_over_the_maps_that_leave_them_out() -> None:
+    tally = MapTally(500, 10, "likelihood", "none")
+    for floating in (3, 6, None):
+        tally.add(dataclasses.replace(a_map(10.5), floating=floating), 0.2)
+    assert tally.summary(RunFrames(), 0.1, RunVerdict.COMPLETE).floating_points == 4.5
+    kept = MapTally(500, 10, "likelihood", "none")
+    kept.add(a_map(10.5), 0.2)
+    assert kept.summary(RunFrames(), 0.1, RunVerdict.COMPLETE).floating_points is None
 
 
 def test_each_verdict_has_its_exit_code() -> None:
