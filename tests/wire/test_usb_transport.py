@@ -22,9 +22,17 @@ from drivers.errors import (
 from drivers.transports.usb_device import attached, open_device, translated
 from sim_backend.wire.serve.usb import EmulatedUsb
 from tests.wire.bodies import outcomes
+from tests.wire.usb import umockdev
 from tests.wire.usb.loopback import LoopbackModel
 from tests.wire.usb.umockdev import UmockdevBus, missing
 from tests.wire.usb_bodies import BODIES, LOOPBACK
+
+
+def test_the_package_s_libusb_is_enough_where_the_system_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(umockdev, "find_library", lambda name: None if "usb-1.0" in name else f"lib{name}.so.0")
+    assert missing() == ""
+    monkeypatch.setattr(umockdev, "find_library", lambda name: None)
+    assert missing() == "not installed: umockdev (apt install umockdev)"
 
 
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: body.__name__)

@@ -4,7 +4,7 @@
         bus.plug(HeliosModel())
         subprocess.run([sys.executable, "-m", "..."], env=bus.environment())
 
-The client runs under `libumockdev-preload.so.0` (Debian packages umockdev and libusb-1.0-0), which sends its ioctl
+The client runs under `libumockdev-preload.so.0` (Debian package umockdev), which sends its ioctl
 calls on /dev/bus/usb/* to a socket of the device, as three 64-bit words (command, argument, argument); memory of the
 client is read and written through the same socket. Structures and numbers: linux/usbdevice_fs.h (64 bit).
 
@@ -28,6 +28,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Self
+
+import libusb_package
 
 from drivers.clock import NS_PER_S, Clock
 from sim_backend.wire.serve.usb_model import AttachedDevice, Setup, UsbFailure, UsbModel
@@ -290,8 +292,11 @@ _POLL_S = 250e-6
 
 def missing() -> str:
     """What this machine lacks for these tests; "" where nothing."""
-    libraries = {"umockdev": "umockdev-preload", "libusb-1.0-0": "usb-1.0"}
-    packages = [package for package, library in libraries.items() if find_library(library) is None]
+    found = {
+        "umockdev": find_library("umockdev-preload"),
+        "libusb-1.0-0": libusb_package.find_library("usb-1.0"),  # the one that the drivers use: usually the package's
+    }
+    packages = [package for package, library in found.items() if library is None]
     return f"not installed: {', '.join(packages)} (apt install {' '.join(packages)})" if packages else ""
 
 
