@@ -94,6 +94,20 @@ def test_trap_an_idle_laser_is_ready_whether_it_says_standby_or_ready(idle: int)
         assert laser.status.emission
 
 
+def test_a_unit_whose_fault_word_has_an_unknown_bit_is_never_armed() -> None:
+    model = ObisModel(words="marked", autostart=True)
+    with wire(model) as (_, surroundings), open_obis(surroundings) as laser:
+        assert laser.ask("SYST:STAT?") == "C8001088"  # type: ignore[attr-defined]
+        model.commands.clear()
+        with pytest.raises(DeviceFault, match=r"fault 0x80000000 \(unknown\); clear it at the laser"):
+            laser.arm(0.05)
+        assert [command for command in model.commands if not command.endswith("?")] == [], "it was only asked"
+        status = laser.status
+        assert (status.fault, status.emission, status.warming_up) == ("0x80000000 (unknown)", False, False)
+    assert not model.emitting
+    assert model.autostart
+
+
 @pytest.mark.parametrize("busy", [0xC8000108, 0xC8000104])
 def test_a_laser_that_warms_up_is_not_ready_whatever_else_it_says(busy: int) -> None:
     class Warming(ObisModel):
