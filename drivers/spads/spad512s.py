@@ -72,6 +72,8 @@ class Spad512sRun:
         self._line = line
         self._block_frames, self._frame_bytes = block_frames, frame_bytes
         self._memory = np.zeros(block_frames * frame_bytes + GUARD_BYTES, np.uint8)
+        self._cut = 0
+        """Frames of the next block if it is cut short, since no more came in time; else 0."""
         self._got = 0
         """Bytes received so far of the present block and of the guard bytes behind it."""
         self._heard_at = time.monotonic()
@@ -83,7 +85,7 @@ class Spad512sRun:
     @property
     def next_n(self) -> int:
         """Number of frames of the next block; 0 if the run is over."""
-        return min(self._block_frames, self.n_frames - self.next_frame)
+        return self._cut or min(self._block_frames, self.n_frames - self.next_frame)
 
     @property
     def ends(self) -> bool:
@@ -94,15 +96,22 @@ class Spad512sRun:
         """Pixels of the next block, uint8 (n * frame bytes,), once `DONE` or `GUARD_BYTES` have followed; None if
         stopped.
 
-        A call continues where the last one ended. Raises `DeviceTimeout` at `ends_at` (of `time.monotonic`),
-        `DeviceFault` with the device's own words, or `ProtocolError`.
+        A call continues where the last one ended. At `ends_at` (of `time.monotonic`) the block is cut short after the
+        frames that are here; raises `DeviceTimeout` if none are. Raises `DeviceFault` with the device's own words, or
+        `ProtocolError`.
         """
-        pixel_bytes = self.next_n * self._frame_bytes
-        wanted = pixel_bytes + (len(DONE) if self.ends else GUARD_BYTES)
+        wanted = self.next_n * self._frame_bytes + (len(DONE) if self.ends else GUARD_BYTES)
         while self._got < wanted:
             if stopped():
                 return None
-            self._receive_some(self._memory[self._got : wanted], ends_at, timeout_s)
+            try:
+                self._receive_some(self._memory[self._got : wanted], ends_at, timeout_s)
+            except DeviceTimeout:
+                self._cut = max(0, self._got - GUARD_BYTES) // self._frame_bytes
+                if not self._cut:
+                    raise
+                break
+        pixel_bytes = self.next_n * self._frame_bytes
         if self.ends:
             self._require_done(pixel_bytes)
         pixels = self._memory[:pixel_bytes]
@@ -115,6 +124,7 @@ class Spad512sRun:
         self._memory[: self._got - used] = self._memory[used : self._got]
         self._got -= used
         self.next_frame += self.next_n
+        self._cut = 0
 
     def _receive_some(self, place: NDArray[np.uint8], ends_at: float, timeout_s: float) -> None:
         n = self._line.receive_into(place.data, min(SLICE_S, max(0.0, ends_at - time.monotonic())))

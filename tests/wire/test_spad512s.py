@@ -288,6 +288,17 @@ def test_frames_that_came_before_a_run_failed_are_kept(
             device.grab(300)  # nothing came
 
 
+def test_frames_of_an_unfinished_block_are_kept_when_the_trigger_stops() -> None:
+    """All but the last one, behind which an error text might begin."""
+    sent = noise(0, 0.0, 0.0, 50)
+    with answering(300, sent.tobytes()) as device:
+        got = device.grab(300, frame_rate_hz=REQUEST.frame_rate_hz, exposure_s=REQUEST.exposure_s, timeout_s=1.0)
+        assert np.array_equal(got.number, np.arange(49))
+        assert isinstance(got.ended_by, DeviceTimeout)
+        assert device.counters.delivered == 49
+        assert device.counters.lost == 251
+
+
 def test_trap_done_glued_to_answers_commands_never_pipelined_and_pile_up_before_every_run() -> None:
     class Strict(Spad512sModel):
         early = False
