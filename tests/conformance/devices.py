@@ -24,12 +24,12 @@ from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
 from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
-from tests.wire.etherdream import let_pass, open_etherdream, turning, wired
-from tests.wire.lasercube import LaserCubeModel
-from tests.wire.lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
-from tests.wire.ni_bench import ni_bench
-from tests.wire.scanners import opened
-from tests.wire.syncs import Board, PulseBox, board, pulse_box, teensy
+from tests.wire.emulated_lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
+from tests.wire.emulated_scanners import opened
+from tests.wire.emulated_syncs import Board, PulseBox, board, pulse_box, teensy
+from tests.wire.scanners.etherdream import let_pass, open_etherdream, turning, wired
+from tests.wire.scanners.lasercube import LaserCubeModel
+from tests.wire.scanners.ni_bench import ni_bench
 
 Factory = Callable[[Path], AbstractContextManager[Any]]
 

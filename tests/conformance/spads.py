@@ -22,7 +22,7 @@ from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.tcp import TcpServer
 from tests.conformance.cases import SpadCase, run
-from tests.wire.lasers import PATIENCE_S
+from tests.wire.emulated_lasers import PATIENCE_S
 from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, opened
 
 Factory = Callable[[Path], AbstractContextManager[SpadCase]]

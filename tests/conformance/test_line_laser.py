@@ -5,7 +5,7 @@ import pytest
 from drivers.errors import LimitExceeded
 from drivers.interfaces import DeviceState
 from tests.conformance.cases import LaserCase, require_final
-from tests.wire.lasers import bring_up
+from tests.wire.emulated_lasers import bring_up
 
 WARM_UP_S = 600.0
 

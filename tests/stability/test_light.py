@@ -20,7 +20,7 @@ from sim_backend.light.view import CameraView
 from sim_backend.scenes.medium import henyey_greenstein
 from sim_backend.scenes.surfaces import checked
 from tests.stability.inventory import EXAMPLES, covers
-from tests.unit.sim.rigs import effect_rate, rig, setting, wall
+from tests.unit.sim_backend.rigs import effect_rate, rig, setting, wall
 
 WALL_M, BASELINE_M, FOCAL_PX = 2.5, 0.3, 110.0
 DEPTHS = (1e-300, 1e-12, 0.01, 1.0, 10.0, 50.0)

@@ -14,7 +14,7 @@ from rig import api
 from rig.config.overrides import configure
 from rig.devices import prepare
 from sim_backend.wire.emulated_world import KEPT_S, EmulatedWorld
-from tests.wire.scan_rig import light, mirror
+from tests.wire.scans.scan_rig import light, mirror
 
 TRUE_EXTINCTION_PER_M = 0.087
 SLOW_HELIOS = {"frame": 0.5, "max_point_rate": 8e3}

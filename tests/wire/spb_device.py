@@ -15,7 +15,7 @@ from drivers.transports.endpoints import Endpoint
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import Span, SpbUsbBoard
 from sim_backend.wire.serve.usb import EmulatedUsb
-from tests.wire.spads import take_run
+from tests.wire.spad_runs import take_run
 
 WIDTH, HEIGHT = 128, 24
 REQUEST = SpadRequest(Fraction(100_000), 1e-5, "stream", block_frames=16)

@@ -34,13 +34,13 @@ from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.serve.tcp import TcpServer
 from sim_backend.wire.serve.usb import EmulatedUsb
-from tests.wire import syncs
-from tests.wire.etherdream import wired
-from tests.wire.lasercube import LaserCubeModel
-from tests.wire.lasers import PATIENCE_S, bring_up, wire
-from tests.wire.ni_bench import ni_bench
+from tests.wire import emulated_syncs as syncs
+from tests.wire.emulated_lasers import PATIENCE_S, bring_up, wire
+from tests.wire.emulated_syncs import board, pulse_box
+from tests.wire.scanners.etherdream import wired
+from tests.wire.scanners.lasercube import LaserCubeModel
+from tests.wire.scanners.ni_bench import ni_bench
 from tests.wire.spb_device import model
-from tests.wire.syncs import board, pulse_box
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "one-device.md"
 *CELLS, EMULATED = (cell.split("```")[0] for cell in PAGE.read_text().split("```python\n")[1:])

@@ -2,7 +2,7 @@
 
 python -m tests.campaigns.devices.guard_false_trips --seconds 3600 --burners 8
 
-One scan after the other, recorded, over emulated wires (tests/wire/scan_rig.py). Beside them run processes that burn
+One scan after the other, recorded, over emulated wires (tests/wire/scans). Beside them run processes that burn
 every processor twice over and one that writes and syncs. In the scan's own process every tenth second a write takes one
 more, a Python thread fights the others for the interpreter, and one does not let go of it for a while (a large sort).
 A scan that ends early for another reason, as a scanner that was not fed in time, is counted beside them.
@@ -16,7 +16,7 @@ import tempfile
 import time
 from contextlib import closing
 
-from tests.wire.scan_rig import PATIENT, Applications, ScanFailedError, scan_bench
+from tests.wire.scans.scan_rig import PATIENT, Applications, ScanFailedError, scan_bench
 
 MAPS = 500
 """Maps of one scan: a quarter of a minute where the emulated devices keep up."""

@@ -3,7 +3,7 @@
 python -m tests.campaigns.devices.guard_kill --kills 1000 --others 100 --seed 1
 
 Each blow has a scan of its own, `rig scan` with real drivers over pseudo terminals and libusb, and emulated devices
-that outlive it (tests/wire/scan_rig.py). Light is emission AND gate. Passes where light is gone after 100 ms at the
+that outlive it (tests/wire/scans). Light is emission AND gate. Passes where light is gone after 100 ms at the
 99.9th percentile and never there after 500 ms, for each sort of blow (500 ms where the gate hears nothing any more),
 where emission is off after 1 s wherever the laser's port still answers, no light ever fell on a mirror at rest, and
 applications that lived ended with code 3 and a line that says why.
@@ -17,8 +17,16 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from tests.wire.scan_rig import Applications, ScanFailedError
-from tests.wire.scan_strikes import BY_HAND, OPENING_S, SCAN_STRIKES, ScanOutcome, lateness_of, strike_scan, trouble_of
+from tests.wire.scans.scan_rig import Applications, ScanFailedError
+from tests.wire.scans.scan_strikes import (
+    BY_HAND,
+    OPENING_S,
+    SCAN_STRIKES,
+    ScanOutcome,
+    lateness_of,
+    strike_scan,
+    trouble_of,
+)
 
 KILL = "application killed"
 

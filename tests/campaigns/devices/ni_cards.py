@@ -26,8 +26,8 @@ from sim_backend.wire.firmware.nidaq import NidaqModel
 from sim_backend.wire.serve.grpc import GrpcServer
 from tests.campaigns.devices import scanners
 from tests.campaigns.outcomes import Ending, close_or_raise
+from tests.wire.emulated_scanners import GALVO
 from tests.wire.faults import Fault, FaultSchedule
-from tests.wire.scanners import GALVO
 
 FAULTS = (Fault.LATE, Fault.LOST, Fault.STALL, Fault.UNPLUG, Fault.HANG, Fault.CORRUPTED, Fault.TRUNCATED)
 """Corrupted: refused. Truncated: done, but told to have failed."""

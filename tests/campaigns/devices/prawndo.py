@@ -4,8 +4,8 @@ import random
 
 from drivers.sync.prawndo_line import PrawnDoTiming
 from tests.campaigns.devices.syncs import Subject
+from tests.wire.emulated_syncs import Board
 from tests.wire.faults import FaultSchedule
-from tests.wire.syncs import Board
 
 TIMING = PrawnDoTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)
 DEADLINE_S = 5.0

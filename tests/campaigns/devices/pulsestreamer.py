@@ -11,8 +11,8 @@ import struct
 
 from drivers.clock import SystemClock
 from tests.campaigns.devices.syncs import Subject
+from tests.wire.emulated_syncs import PulseBox
 from tests.wire.faults import Fault, FaultSchedule
-from tests.wire.syncs import PulseBox
 
 KINDS = tuple(kind for kind in Fault if kind not in (Fault.CORRUPTED, Fault.MERGED))
 CALL_S = 0.15

@@ -20,10 +20,10 @@ from sim_backend.wire.firmware import helios
 from sim_backend.wire.firmware.etherdream import EtherDreamModel
 from sim_backend.wire.firmware.helios import DacHistory
 from tests.campaigns.outcomes import Ending, ending
-from tests.wire import lasercube
-from tests.wire.etherdream import open_etherdream, wired
+from tests.wire.emulated_scanners import finish, open_scanner, plug
 from tests.wire.faults import Fault, FaultSchedule, FaultyUsb
-from tests.wire.scanners import finish, open_scanner, plug
+from tests.wire.scanners import lasercube
+from tests.wire.scanners.etherdream import open_etherdream, wired
 
 POINTS, LINE_POINTS, RATE_HZ = 700, 50, 25_000.0
 DEADLINE_S = 30.0

@@ -7,8 +7,8 @@ import random
 from functools import partial
 
 from tests.campaigns.devices.syncs import Subject
+from tests.wire.emulated_syncs import TeensyBoard
 from tests.wire.faults import FaultSchedule
-from tests.wire.syncs import TeensyBoard
 
 REPLY_S = 0.06
 DEADLINE_S = 1.0

@@ -32,7 +32,7 @@ from sim_backend.effects.catalogue import CATALOGUE
 from sim_backend.frames.flux import FluxModel
 from tests.reference.photon_tracer import traced
 from tests.reference.tables.printed import Table
-from tests.unit.sim.rigs import setting, wall
+from tests.unit.sim_backend.rigs import setting, wall
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ import pytest
 
 from sim_backend.frames.flux import FluxModel
 from tests.benchmarks.numpy_frames import NumpyFrames
-from tests.unit.sim.rigs import rig, setting, wall
+from tests.unit.sim_backend.rigs import rig, setting, wall
 
 
 @pytest.mark.parametrize("baseline_m", [0.3, -0.3], ids=["scanner left", "scanner right"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from drivers.frames import FRAME_RECORD, FrameBlock, packed_row_bytes
-from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
+from tests.unit.drivers.spb1.spb1_bytes import GOLDEN_HEADER
 
 
 def test_rows_are_padded_to_whole_words() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from drivers.errors import DeviceFault, DeviceTimeout, RingOverflow, WrongState
 from drivers.frames import FRAME_RECORD, FrameBlock
 from drivers.ring import BlockRing, OnFull, RingReader
-from tests.unit.drivers.spb1_bytes import GOLDEN_HEADER
+from tests.unit.drivers.spb1.spb1_bytes import GOLDEN_HEADER
 
 STRIDE = 4096
 

@@ -11,7 +11,7 @@ from rig.calibrate.session import load_view, load_views, save_view
 from rig.calibrate.sources import sort_sources
 from rig.config.overrides import configure
 from rig.errors import UsageError
-from tests.system.board_rig import write_board_rig
+from tests.system.calibrate.board_rig import write_board_rig
 
 
 def test_a_scene_that_has_none_is_replaced_and_it_is_said() -> None:

@@ -1,4 +1,4 @@
-"""Rows, fronts, choice and files of a trade-off; the command is in tests/system/test_cli_tradeoff.py."""
+"""Rows, fronts, choice and files of a trade-off; the command is in tests/system/cli/test_cli_tradeoff.py."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
