@@ -86,9 +86,6 @@ class ReconstructRequest:
     estimator: str | None = option(None, "auto, argmax, edge, likelihood or joint", unset="as configured, else auto")
     filter: str | None = option(None, "none or median (5 x 5)", unset="as configured, else none")
     min_confidence: float | None = option(None, "least confidence in the depth map", unset="as configured, else 0.5")
-    keep_floating: bool | None = option(
-        None, "keep points of the depth map that float between two surfaces", unset="as configured, else no"
-    )
     accept_calibration: bool = _accept_calibration()
     out: str | os.PathLike[str] | None = _out()
 

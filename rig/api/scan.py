@@ -142,8 +142,8 @@ def replay(
 
 
 def _configured(config: Config, request: ScanRequest) -> RigConfig:
-    changed = "scene", "exposures", "estimator", "filter", "min_confidence", "keep_floating"
-    return configure(config, **_chosen(request, *changed, "temporal_prior", "learned"))
+    changed = "scene", "exposures", "estimator", "filter", "min_confidence", "temporal_prior", "learned"
+    return configure(config, **_chosen(request, *changed))
 
 
 def _chosen(request: object, *names: str) -> dict[str, Any]:
@@ -224,8 +224,7 @@ def reconstruct(
             raise UsageError(
                 "the calibration for a recording is a file; calibration.files.rig_file.save_rig_model writes one"
             )
-        names = "estimator", "filter", "min_confidence", "keep_floating", "accept_calibration", "out"
-        asked = _chosen(request, *names)
+        asked = _chosen(request, "estimator", "filter", "min_confidence", "accept_calibration", "out")
         return replay(source, clock="max", calibration=calibration, progress=progress, **asked)
     if plan is None or calibration is None:
         if not source.exists():
@@ -258,5 +257,4 @@ def _estimate(request: ReconstructRequest) -> EstimateConfig:
     if problems:
         raise UsageError.of(problems)
     content = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}
-    content["keep_floating"] = bool(request.keep_floating)
     return EstimateConfig.model_validate(content)

@@ -30,7 +30,6 @@ FLAGS: Mapping[Key, str] = {
     ("estimate", "estimator"): "estimator",
     ("estimate", "filter"): "filter",
     ("estimate", "min_confidence"): "min_confidence",
-    ("estimate", "keep_floating"): "keep_floating",
     ("estimate", "temporal_prior"): "temporal_prior",
     ("estimate", "learned"): "learned",
     ("estimate", "threads"): "threads",

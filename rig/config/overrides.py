@@ -26,7 +26,6 @@ def configure(
     estimator: Estimator | None = None,
     filter: Filter | None = None,
     min_confidence: float | None = None,
-    keep_floating: bool | None = None,
     temporal_prior: bool | None = None,
     learned: PathLike | None = None,
 ) -> RigConfig:
@@ -36,7 +35,7 @@ def configure(
     scene: for a simulated rig: the name of a bundled scene, or a path.
     fog: replaces the scene's fog: a visibility such as '20 m', or 'clear'.
     exposures: frames per column.
-    estimator, filter, min_confidence, keep_floating: as in the config's `estimate`.
+    estimator, filter, min_confidence: as in the config's `estimate`.
     temporal_prior: make `joint` use the last map as a weak prior for the next.
     learned: file in which scans keep what the estimator has learned.
     Raises UsageError with one line per problem.
@@ -48,7 +47,6 @@ def configure(
         "estimate.estimator": estimator,
         "estimate.filter": filter,
         "estimate.min_confidence": min_confidence,
-        "estimate.keep_floating": keep_floating,
         "estimate.temporal_prior": temporal_prior,
         "estimate.learned": None if learned is None else os.path.abspath(learned),
     }

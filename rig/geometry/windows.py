@@ -98,7 +98,7 @@ class SweepGeometry:
         return np.asarray(left + px_per_tangent * (u - u_left))
 
     def px_per_inverse_depth(self) -> float:
-        """How many px a stripe moves along its row per 1/m of inverse depth, without sign: the median of the columns.
+        """Motion of a stripe along its row, in px per 1/m of inverse depth, without sign: the median of the columns.
 
         0 if no row has two pixels with a ray.
         """

@@ -76,7 +76,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
     require_playable(run, manifest)
     recorded = manifest.get("config") or {}
     calibration = run / CALIBRATION_FILE
-    settings = ("estimator", "filter", "min_confidence", "keep_floating", "threads")
+    settings = ("estimator", "filter", "min_confidence", "threads")
     given = {name: value for name in settings if (value := getattr(request, name)) is not None}
     content: dict[str, Any] = {
         "name": f"replay of {recorded.get('name') or run.name}",
