@@ -85,8 +85,7 @@ class TcpServer(WireServer[TcpModel]):
         took = self._take(now_s)
         gave = self._give(now_s)
         if self._client is not None and not self._outbox and getattr(self.model, "hung_up", False):
-            self._drop_client(reset=False)
-            self._listen()
+            self._hang_up(reset=False)
         return gave or took
 
     def _accept(self, now_s: float) -> bool:
@@ -115,8 +114,7 @@ class TcpServer(WireServer[TcpModel]):
         if data:
             self.model.receive(data, now_s)
         else:
-            self._drop_client()
-            self._listen()
+            self._hang_up()
         return True
 
     def _give(self, now_s: float) -> bool:
@@ -142,9 +140,13 @@ class TcpServer(WireServer[TcpModel]):
         except BlockingIOError:
             return 0
         except OSError:
-            self._drop_client()
-            self._listen()
+            self._hang_up()
             return len(data)
+
+    def _hang_up(self, *, reset: bool = True) -> None:
+        """End the connection, and take the next client; at once, since this one may come back as soon as it notices."""
+        self._listen()
+        self._drop_client(reset=reset)
 
     def _drop_client(self, *, reset: bool = True) -> None:
         """End the connection. reset: whether to reset it, as when a program ends; else what was sent still arrives."""

@@ -16,6 +16,7 @@ import yaml
 
 from drivers.errors import DeviceError
 from rig import requests
+from rig.cli.command import in_options
 from rig.cli.main import app
 from rig.config.bundled import BUNDLED
 from rig.config.files import bundled_configs
@@ -308,5 +309,5 @@ def test_a_field_of_a_request_is_an_option_and_is_described_once(command: str) -
     options = {each.name: each for each in typer.main.get_command(app).commands[command].params}  # type: ignore[attr-defined]
     for field in fields(request):
         about = field.metadata["about"]
-        assert options[field.name].help == about
+        assert options[field.name].help == in_options(about)
         assert f"{field.name}: {about} (default: " in request.__doc__
