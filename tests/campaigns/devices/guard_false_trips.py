@@ -23,10 +23,11 @@ MAPS = 500
 PATIENCE_S = 300.0
 TRIPPED = ("guard: ", "the laser guard hangs")
 """Words where the guard took the light, or was itself taken for dead."""
-BURN = "while True: pass"
+BURN = "import os; parent = os.getppid()\nwhile os.getppid() == parent: pass"
 WRITE = """
 import os, sys
-while True:
+parent = os.getppid()
+while os.getppid() == parent:
     with open(sys.argv[1], "wb") as file:
         file.write(bytes(1 << 26))
         file.flush()
