@@ -25,8 +25,8 @@ from drivers.interfaces import HOLD_S, Pulse, SyncStatus
 from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import Kind, KindConfig, Surroundings, alone, config_of
 from drivers.sync.board import SyncBoard
-from drivers.sync.teensy_line import DONE, REPLY_S, STATUS, TRIES, TeensyLine
-from drivers.transports.endpoints import resolve
+from drivers.sync.teensy_line import DONE, EMULATED_REPLY_S, REPLY_S, STATUS, TRIES, TeensyLine
+from drivers.transports.endpoints import EMULATED_PREFIX, resolve
 from drivers.transports.serial_device import SerialDevice
 from drivers.transports.serial_port import SerialPort
 from drivers.units import Seconds
@@ -101,13 +101,14 @@ class Teensy(SerialDevice, SyncBoard):
 
     _line: TeensyLine
 
-    def __init__(self, config: TeensyConfig, surroundings: Surroundings, reply_s: float = REPLY_S) -> None:
+    def __init__(self, config: TeensyConfig, surroundings: Surroundings, reply_s: float | None = None) -> None:
         super().__init__("Teensy")
         self._watchdog_s = config.watchdog
         self._loaded = False
         self._over = threading.Event()
         port = SerialPort(self.name, resolve(config.port, surroundings.ports), surroundings.tap)
-        self._line = TeensyLine(self.name, port, reply_s)
+        usual_s = EMULATED_REPLY_S if config.port.startswith(EMULATED_PREFIX) else REPLY_S
+        self._line = TeensyLine(self.name, port, usual_s if reply_s is None else reply_s)
         try:
             version, serial, *limits = self._line.connect().groups()
             if version != VERSION:
