@@ -1,4 +1,4 @@
-"""The rig model and its mathematics: camera, light planes, triangulation, and the calibration file.
+"""The rig model of spadrig and its mathematics: camera, light planes, triangulation, and the calibration file.
 
 Input: pictures of a board, counts of sweeps and of dark frames, calibration files. Output: a rig model with its
 covariance and a verdict on it, the lags, and a map of the pixels. Mostly functions of arrays; no module keeps state,

@@ -14,7 +14,12 @@ UsageError for a request that cannot be met, and DeviceError or DevicesError if 
 error are in `out`.
 """
 
+from spadrig.names import require_own_names
+
+require_own_names()  # here too: another package `rig` may have overwritten only `rig/__init__.py`
+
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
+from rig.api.runs import repeat, runs
 from rig.api.scan import plan_scan, reconstruct, replay, scan
 from rig.api.tradeoff import tradeoff
 from rig.bench.soak import soak
@@ -40,6 +45,7 @@ from rig.requests import (
     PlanesRequest,
     ReconstructRequest,
     ReplayRequest,
+    RunsRequest,
     ScanRequest,
     SoakRequest,
     SyncRequest,
@@ -61,6 +67,7 @@ __all__ = [
     "ReconstructRequest",
     "ReplayRequest",
     "RunResult",
+    "RunsRequest",
     "ScanRequest",
     "SoakRequest",
     "SyncRequest",
@@ -89,7 +96,9 @@ __all__ = [
     "reconstruct",
     "recording_info",
     "repair",
+    "repeat",
     "replay",
+    "runs",
     "scan",
     "soak",
     "tradeoff",
