@@ -4,7 +4,7 @@ BIN := .venv/bin
 # As `rig` does itself: threads of numpy's linear algebra only get into each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo help install test checks kernels lint types layers house unit clean
+.PHONY: demo help install test checks kernels lint types layers house docs figures unit clean
 .PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
@@ -18,8 +18,9 @@ help:  ## this list
 	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile
 
 # The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
-test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures and all tests
+test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
 	$(MAKE) --jobs=2 --output-sync=target checks kernels
+	$(MAKE) docs
 	$(PYTEST) --durations=25
 
 checks: lint types layers house
@@ -35,6 +36,10 @@ layers: .venv/.installed-tests
 	$(BIN)/lint-imports
 house: .venv/.installed-tests
 	$(BIN)/python -m tests.reference.house --limits
+docs: .venv/.installed-tests  ## the documentation site in docs/_build/html; its warnings are errors; needs no network
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . docs/_build/html
+figures: .venv/.installed-tests  ## draw the figures of docs/figures/ anew
+	$(BIN)/python -m docs.generate.figures
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
 PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile
@@ -95,8 +100,8 @@ campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deli
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 .venv/.installed-tests: pyproject.toml .venv/.created
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[tests]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[tests,docs]'
 	touch $@ .venv/.installed
 
 clean:  ## remove .venv, caches and runs
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache runs
+	rm -rf docs/_build .venv .mypy_cache .ruff_cache .pytest_cache runs

@@ -21,7 +21,7 @@ SLOTS = ("spad", "scanner", "laser", "sync", "world")
 class KindConfig(BaseModel):
     """Base of every kind's config. Unknown keys are refused and values cannot change. `kind` names the entry point."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     real_time: ClassVar[bool] = True
     """Whether the kind runs in the host's time. A laser or sync source that does is owned by the guard. If the world

@@ -57,8 +57,11 @@ class CommandGridConfig(Section):
     """Number of columns, and the mirror commands at the centres of the first and the last."""
 
     first: float
+    """Mirror command at the centre of the first column."""
     last: float
+    """Mirror command at the centre of the last column."""
     columns: int = Field(ge=1)
+    """Number of columns."""
 
 
 class WorldConfig(KindConfig):
@@ -68,7 +71,8 @@ class WorldConfig(KindConfig):
 
     kind: str = "simulated"
     geometry: str | None = None
-    """Rig-model file of the rig as it really is; the bundled simulated rig by default. Its sheets are simulated even if
+    """Calibration file, with `source_m`, of the rig as it really is; the bundled simulated rig by default. To try the
+    effect of a wrong calibration, give another file here than in `calibration`. Its sheets are simulated even if
     they bow, pass beside the mirror's axis or are tilted towards it (`cone_rad`), and so is its row delay."""
     scene: str = "street"
     """A bundled scene's name, a scene file, or a folder of surfaces."""

@@ -37,14 +37,17 @@ class GalvoConfig(KindConfig):
     """Port: "usb"; if several are attached, "usb:serial=ABC" for a LaserCube or "usb:path=1-2" for a Helios, which has
     no serial number; or "emulated:NAME"."""
     axis: Literal["x", "y"] = "x"
+    """Output that drives the mirror."""
     max_velocity: Annotated[PerSecond, Field(gt=0, le=1e6)]
     """Largest change of the normalised drive per second; its full range is 2."""
     max_acceleration: Annotated[PerSecondSquared, Field(gt=0, le=1e10)]
+    """Largest change of the drive's velocity per second."""
     max_step: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Largest change of the drive from one point to the next."""
     rms_duty: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Largest root-mean-square acceleration as a share of max_acceleration. It bounds the galvo's heat."""
     command_range: tuple[Drive, Drive] = (-1.0, 1.0)
+    """Lowest and highest drive to which the mirror may be sent."""
     park: Drive = -1.0
     """Drive at which the beam hits the dump; within command_range."""
 

@@ -86,26 +86,30 @@ class NidaqConfig(GalvoConfig):
     """Port: the card's name in NI MAX, such as "Dev1"; "grpc=HOST:PORT/Dev1" behind NI's gRPC device server; or
     "emulated:NAME"."""
     channel: Annotated[str, Field(pattern=r"^ao\d+$")] = "ao0"
+    """Output that drives the mirror."""
     full_scale: Annotated[Volts, Field(gt=0, le=10)] = 10.0
     """Voltage at drive 1; at drive -1 it is the negative of that."""
     line_marker: MarkerOutput | None = "port0/line0"
+    """Output of the line marker; null: not wired. port0/lineN: a line with a clock. ctrN: a counter, for cards without
+    such lines; it can only make a marker that is periodic over the whole waveform."""
     scan_marker: MarkerOutput | None = "port0/line1"
+    """Output of the scan marker, in the same form."""
     backward_marker: MarkerOutput | None = "port0/line2"
-    """Output of each marker; null: not wired. port0/lineN: a line with a clock. ctrN: a counter, for cards without such
-    lines; it can only make a marker that is periodic over the whole waveform."""
+    """Output of the marker of the way back, in the same form."""
     counted_at: Terminal | None = None
     """Terminal at which counters see the sample clock; None: they take it inside the card."""
     clock: Terminal = "onboard"
     """Sample clock of waveforms: "onboard", or a terminal that gets one edge per point."""
     clock_rate: ExactHertz | None = None
-    """Rate of an external clock."""
+    """Rate of an external clock, one rising edge per point. It is then the only point rate."""
     start: Terminal = "now"
     """Start of a waveform: "now", or a terminal whose rising edge starts it."""
     start_wait: Annotated[Seconds, Field(gt=0, le=3600)] = 60.0
     """Longest wait for the first point of a waveform with an external clock or start trigger."""
     clock_out: Terminal | None = None
+    """Terminal to which waveforms send their sample clock."""
     start_out: Terminal | None = None
-    """Terminals to which waveforms send their sample clock and start trigger."""
+    """Terminal to which waveforms send their start trigger."""
     max_point_rate: Annotated[Hertz, Field(gt=LOWEST_RATE_HZ, le=1e6)] = 100_000.0
     """Most points per second; the card may allow less."""
     buffer: Annotated[Seconds, Field(ge=0.02, le=2)] = 0.2

@@ -54,7 +54,7 @@ LineOffsets = Annotated[
     tuple[Annotated[float, Field(ge=-2, le=2, allow_inf_nan=False)], ...],
     AfterValidator(_in_order),
     Field(
-        description="places of the lines that leave the mirror together, in units of its command, ascending",
+        description="places of 1 to 16 lines that leave the mirror together, in units of its command, ascending",
         examples=["[-0.22, 0.22]"],
     ),
 ]
@@ -91,7 +91,10 @@ def _two_ends(value: tuple[float, float]) -> tuple[float, float]:
 DepthRange = Annotated[
     tuple[Metres, Metres],
     AfterValidator(_near_below_far),
-    Field(description="nearest and farthest depth to look for", examples=["[1 m, 8 m]"]),
+    Field(
+        description="nearest and farthest depth to look for; a narrower range is faster and gives fewer wrong answers",
+        examples=["[1 m, 8 m]"],
+    ),
 ]
 Columns = Annotated[int, Field(ge=1, le=65535, description="laser line positions of a sweep", examples=[500])]
 Exposures = Annotated[int, Field(ge=1, le=65535, description="frames nominally taken per column (K)", examples=[10])]
@@ -110,7 +113,8 @@ class ScanConfig(ConfigSection):
         tuple[Command, Command],
         AfterValidator(_two_ends),
         Field(
-            description="mirror drive (-1 to 1) at the outer edges of the first and the last column; may run downward",
+            description="mirror drive at the outer edges of the first and the last column; may run downward. Run-in and "
+            "run-out need room beyond it",
             examples=["[-0.9, 0.9]"],
         ),
     ] = (-0.9, 0.9)
@@ -121,11 +125,13 @@ class ScanConfig(ConfigSection):
         default=MIN_DARK_FRACTION,
         ge=MIN_DARK_FRACTION,
         lt=1,
-        description="least share of a sweep's frames taken with the gate low",
+        description="least share of a sweep's frames taken with the gate low, from which dark counts are learned",
         examples=[0.05],
     )
     exposure: Annotated[Seconds, Field(gt=0)] | None = Field(
-        default=None, description="exposure of a frame; the whole frame period where not given", examples=["10 us"]
+        default=None,
+        description="exposure of a frame, at most the frame period; the whole period where not given",
+        examples=["10 us"],
     )
     power: Annotated[Watts, Field(gt=0)] | None = Field(
         default=None, description="laser power of the scan; the laser's limit where not given", examples=["20 mW"]
@@ -163,15 +169,27 @@ def _beside_config(value: Path | None, info: ValidationInfo) -> Path | None:
 class EstimateConfig(ConfigSection):
     """Settings of the estimate, which turns counts into depth."""
 
-    estimator: Estimator = Field(default=AUTO, description="how the stripe is found on each row", examples=["joint"])
+    estimator: Estimator = Field(
+        default=AUTO,
+        description="how the stripe is found on each row; auto is joint where that is fast enough, else likelihood",
+        examples=["joint"],
+    )
     filter: Filter = Field(
-        default="none", description="what is done to the stripe positions afterwards", examples=["median"]
+        default="none",
+        description="what is done to the stripe positions afterwards: median is one of 5 x 5 rows and columns",
+        examples=["median"],
     )
     min_confidence: float = Field(
-        default=0.5, ge=0, le=1, description="answers below this confidence do not enter the depth map", examples=[0.5]
+        default=0.5,
+        ge=0,
+        le=1,
+        description="answers below it do not enter the depth map; the stripe table keeps them",
+        examples=[0.5],
     )
     keep_floating: bool = Field(
-        default=False, description="keep points of the depth map that float between two surfaces", examples=["true"]
+        default=False,
+        description="keep points of the depth map that float between two surfaces; else they are left out and counted",
+        examples=["true"],
     )
     temporal_prior: bool = Field(
         default=False,
@@ -227,7 +245,8 @@ class RigConfig(ConfigSection):
 
     name: str = Field(min_length=1, description="name of the rig, for people", examples=["lab"])
     calibration: Annotated[Path | None, AfterValidator(_beside_config)] = Field(
-        default=None, description="calibration file, relative to this file; without one there is no depth"
+        default=None,
+        description="calibration file, relative to this file; without one there are stripes but no depth",
     )
     calibration_max_age: Annotated[Age, Field(gt=0)] | None = Field(
         default=None,

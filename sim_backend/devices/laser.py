@@ -17,6 +17,7 @@ class SimulatedLaserConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     max_power: Annotated[Watts, Field(gt=0)] = 0.1
+    """Largest power."""
 
 
 def create(config: SimulatedLaserConfig, surroundings: Surroundings) -> PlainLaser:

@@ -143,6 +143,7 @@ class SimulatedSpadConfig(KindConfig):
 
     kind: Literal["simulated"] = "simulated"
     max_frame_rate: Annotated[ExactHertz, Field(gt=0)] = Fraction(100_000)
+    """Highest frame rate."""
     link: Annotated[BytesPerSecond, Field(gt=0)] = 8e9
     """Bytes per second that the link to the computer carries. If full frames need more, scans use moving windows.
     The default is more than 512 x 512 pixels at 100 kHz need."""

@@ -24,7 +24,9 @@ class Optics(Section):
     """Lens and filter in front of the sensor."""
 
     f_number: float = Field(default=2.0, gt=0)
+    """f-number of the lens."""
     transmission: float = Field(default=0.85, gt=0, le=1)
+    """Transmission of lens and filter."""
     filter_width: Annotated[Metres, Field(gt=0)] = 10e-9
     """Bandwidth of the filter around the laser line; it decides how much ambient light gets in."""
     focus: Annotated[Metres, Field(gt=0)] | None = None
@@ -35,8 +37,11 @@ class Sensor(Section):
     """The SPAD array's pixels. The defaults describe the 512 x 512 class at 520 nm."""
 
     pitch: Annotated[Metres, Field(gt=0)] = 16.38e-6
+    """Distance between neighbouring pixels."""
     fill_factor: float = Field(default=0.105, gt=0, le=1)
+    """Share of a pixel's area that detects light."""
     detection_probability: float = Field(default=0.5, gt=0, le=1)
+    """Probability that a photon on this area is detected."""
     dark_rate: Annotated[CountsPerSecond, Field(ge=0)] = 20.0
     """Median dark rate of the pixels; the distribution has a heavy tail of hot ones."""
     pixel_seed: int = Field(default=1, ge=0)
@@ -68,6 +73,7 @@ class Line(Section):
     """The laser line as the scene and the camera see it."""
 
     wavelength: Annotated[Metres, Field(gt=0)] = 520e-9
+    """Wavelength of the laser."""
     fan: Annotated[Radians, Field(gt=0, lt=math.pi)] = math.radians(50)
     """Angle over which the power is spread evenly; it is assumed to cover the picture."""
     sigma_px: float = Field(default=0.6, gt=0.05, le=20)

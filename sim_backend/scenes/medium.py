@@ -69,20 +69,23 @@ def henyey_greenstein(cosine: Any, g: float) -> Any:
 class Section(BaseModel):
     """Part of a config or a scene file. Unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Fog(Section):
     """Fog, given by its visibility (2 % contrast)."""
 
     visibility: Annotated[Metres, Field(gt=0, examples=["30 m"])]
+    """Distance at which contrast falls to 2 %: the extinction is 3.912 / visibility."""
 
 
 class Smoke(Section):
     """Smoke, given by its extinction or its visibility (2 % contrast)."""
 
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.5 /m"])
+    """Extinction of wood smoke. Exactly one of this and `visibility` is given."""
     visibility: Annotated[Metres, Field(gt=0)] | None = Field(default=None, examples=["30 m"])
+    """Distance at which contrast falls to 2 %."""
 
     @model_validator(mode="after")
     def _one_density(self) -> "Smoke":
@@ -95,9 +98,12 @@ class Phase(Section):
     """A Henyey-Greenstein phase function of mean cosine g, or the sum of several as (weight, g)."""
 
     g: MeanCosine | None = Field(default=None, examples=["0.85"])
+    """Mean cosine of a Henyey-Greenstein phase function: `phase: {g: 0.85}`. Or write `phase: isotropic`."""
     terms: tuple[tuple[Annotated[float, Field(gt=0)], MeanCosine], ...] | None = Field(
         default=None, examples=["[[0.9, 0.9], [0.1, -0.5]]"]
     )
+    """(weight, g) of several Henyey-Greenstein terms: `[[0.9, 0.9], [0.1, -0.5]]`. Weights above 0 add up to 1, each g
+    is between -1 and 1."""
 
     @model_validator(mode="after")
     def _whole(self) -> "Phase":
@@ -116,6 +122,7 @@ class Medium(Section):
     fog: Fog | None = Field(default=None, examples=["{visibility: 30 m}"])
     smoke: Smoke | None = Field(default=None, examples=["{extinction: 0.5 /m}"])
     extinction: Annotated[PerMetre, Field(gt=0)] | None = Field(default=None, examples=["0.1 /m"])
+    """Extinction of the medium. Exactly one of `fog`, `smoke` and `extinction` is given."""
     backscatter: PerSteradian = DROPLET_BACKSCATTER
     """Phase function near 180 degrees, if no `phase` is given. Water droplets 0.05, smoke 0.027, isotropic 0.0796."""
     phase: Literal["isotropic"] | Phase | None = Field(default=None, examples=["{g: 0.85}"])
@@ -238,10 +245,11 @@ class Rain(Section):
     """Rain, given by the amount of water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.3, examples=["20 mm/h"])]
+    """Rain rate; drop sizes by Marshall and Palmer."""
     backscatter: PerSteradian = DROPLET_BACKSCATTER
     """Phase function of a drop near 180 degrees."""
     wind: MetresPerSecond = 0.0
-    """Drift towards +x."""
+    """Speed of drift towards +x (right)."""
 
     @property
     def sizes(self) -> Sizes:
@@ -266,9 +274,11 @@ class Snow(Section):
     """Snow, given by the amount of water that falls."""
 
     rate: Annotated[MetresPerHour, Field(gt=0, le=0.05, examples=["2 mm/h"])]
+    """Rate as melted water; flake sizes by Gunn and Marshall."""
     albedo: float = Field(default=0.9, ge=0, le=1, examples=["0.9"])
+    """Albedo of a flake."""
     wind: MetresPerSecond = 0.0
-    """Drift towards +x."""
+    """Speed of drift towards +x (right)."""
 
     @property
     def sizes(self) -> Sizes:

@@ -28,6 +28,7 @@ class AmbientLight(Section):
     """Daylight or lamps on the scene, diffuse."""
 
     illuminance: Annotated[Lux, Field(ge=0, examples=["100 lux"])]
+    """Diffuse daylight or lamp light on the scene."""
 
 
 class SceneMotion(Section):
@@ -59,6 +60,7 @@ class SceneFile(Section):
     """A whole scene file."""
 
     surfaces: str = Field(default="street", examples=["street"])
+    """Surfaces: `street`, `board`, or a folder with `world.npz`, relative to this file."""
     board: SceneBoard | tuple[SceneBoard, ...] = Field(
         default=(), examples=["{rotation: [20 deg, 0 deg, 0 deg], position: [-30 cm, -20 cm, 1.5 m]}"]
     )
