@@ -1,6 +1,6 @@
 """Depth on the camera grid: a pixel's column is interpolated between the stripes of neighbouring columns on its row.
 
-Depth is z in metres, float32 (rows, width), NaN where there is none (`depth_map`; the rule is in `rig.depth.kernels`).
+Depth is z in metres, NaN where there is none (`depth_map`; the rule is in `rig.depth.kernels`).
 
 With several lines, columns that are lit together may claim the same stripe. An estimator looks at one column at a time.
 If search windows overlap it also sees the stripes of the other columns, and may take the brightest one for its own. At
@@ -9,28 +9,58 @@ most one of the claims is right. So coinciding answers of one row and place of t
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
-from rig.simd import Float32
+from rig.simd import Bools, Float32
 from rig.threads import RowWorkers
+
+
+class DepthMap(NamedTuple):
+    """Depth on the camera grid, with what it is worth; all arrays float32 (rows, width).
+
+    depth_m: z in metres, NaN where there is none. confidence: the lower one of the two stripes between which the pixel
+    lies, 0 where there is no depth. depth_sd_m: standard deviation of the depth in metres, NaN where there is none. It
+    follows from `x_sd_px` of these two stripes: it holds if they are the right ones, without the calibration's error.
+    """
+
+    depth_m: Float32
+    confidence: Float32
+    depth_sd_m: Float32
+
+    @classmethod
+    def empty(cls, rows: int, width: int) -> "DepthMap":
+        """A map without any depth."""
+        nan = np.full((rows, width), np.nan, np.float32)
+        return cls(nan, np.zeros((rows, width), np.float32), nan.copy())
+
+    def without(self, points: Bools) -> "DepthMap":
+        """The map without the depths of these pixels, bool (rows, width)."""
+        if not points.any():
+            return self
+        left = DepthMap(*(values.copy() for values in self))
+        left.depth_m[points], left.confidence[points], left.depth_sd_m[points] = np.nan, 0.0, np.nan
+        return left
 
 
 def depth_map(
     stripes: StripeTable, geometry: SweepGeometry, min_confidence: float, workers: RowWorkers | None = None
-) -> Float32:
-    """Depth z in metres (rows, width) float32, NaN where no two neighbouring stripes of one surface enclose the pixel.
+) -> DepthMap:
+    """Depth of the pixels that two neighbouring stripes of one surface enclose, with its confidence and its error.
 
-    Only stripes of at least `min_confidence` are used. Depth is also NaN if 1/z is above 1.1 / near or below 0.9 / far,
-    with near and far the limits of the depth range.
+    Only stripes of at least `min_confidence` are used. There is also no depth if 1/z is above 1.1 / near or below
+    0.9 / far, with near and far the limits of the depth range.
     """
-    from rig.depth.kernels import fill_rows
+    from rig.depth.kernels import depth_rows, fill_rows
 
     near_m, far_m = geometry.depth_range_m
-    depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+    lowest, highest = np.float32(0.9 / far_m), np.float32(1.1 / near_m)
+    shape = geometry.rows, geometry.width
+    depth = DepthMap(np.empty(shape, np.float32), np.full(shape, -1.0, np.float32), np.empty(shape, np.float32))
     light = geometry.light
 
     def work(first: int, last: int) -> None:
@@ -39,13 +69,12 @@ def depth_map(
         command = np.full(inverse_depth.shape if light is not None else (0, 0), np.nan)
         fill_rows(
             stripes.x_px[rows], stripes.confidence[rows], stripes.x_sd_px[rows], min_confidence, geometry.plane,
-            geometry.u[rows], geometry.v[rows], inverse_depth, np.full(inverse_depth.shape, -1.0, np.float32),
+            geometry.u[rows], geometry.v[rows], inverse_depth, depth.confidence[rows], depth.depth_sd_m[rows],
             np.zeros(0) if light is None else light.commands, command,
         )  # fmt: skip
         if light is not None:
             inverse_depth = light.inverse_depth(command, first)
-        inside = (inverse_depth <= 1.1 / near_m) & (inverse_depth >= 0.9 / far_m)
-        depth[rows][inside] = 1.0 / inverse_depth[inside]
+        depth_rows(inverse_depth, lowest, highest, depth.depth_m[rows], depth.confidence[rows], depth.depth_sd_m[rows])
 
     (workers or RowWorkers(1)).over(geometry.rows, work)
     return depth

@@ -31,17 +31,15 @@ _ENOUGH: Final = ((2 * AROUND + 1) ** 2 - 1) // LEAST_SHARE
 """Points on its surface with which a point does not float, however many there are around."""
 
 
-def without_floating(
-    depth_m: Float32, px_per_inverse_depth: float, workers: RowWorkers | None = None
-) -> tuple[Float32, int]:
-    """The depth map with NaN for points that float between two surfaces, and the number of these points.
+def floating_points(depth_m: Float32, px_per_inverse_depth: float, workers: RowWorkers | None = None) -> Bools:
+    """The points of a depth map that float between two surfaces, bool (rows, width).
 
     depth_m: (rows, width), NaN where there is none. px_per_inverse_depth: px of disparity per 1/m of inverse depth.
     """
     disparity = np.float32(px_per_inverse_depth) / depth_m
     floats = np.zeros(depth_m.shape, np.bool_)
     (workers or RowWorkers(1)).over(len(depth_m), lambda first, last: mark_floating(disparity, first, last, floats))
-    return np.where(floats, np.float32(np.nan), depth_m), int(np.count_nonzero(floats))
+    return floats
 
 
 @numba.njit(cache=True, nogil=True)

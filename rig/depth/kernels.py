@@ -4,7 +4,13 @@
 
     inverse depth = (1 - f) p_a.(u, v, 1) + f p_b.(u, v, 1),    f = (x - xa) / (xb - xa)
 
-with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width).
+with planes p float64 (columns, 3) and rays u, v float32 (rows, width); inverse depth is float32 (rows, width). A stripe
+that is off by 1 px along its row changes inverse depth by s = |p_a.(du, dv, 0)|, with (du, dv) the change of the ray
+from one pixel to the next. So with the standard deviations of both stripes
+
+    sd of inverse depth = s sqrt(((1 - f) sd_a)^2 + (f sd_b)^2)
+
+`depth_rows` turns inverse depth w into depth 1 / w, whose standard deviation is that of w over w^2.
 `add_clear_rows` adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the
 stripes of a sweep.
 """
@@ -28,9 +34,10 @@ SPACING_SIGMAS: Final = 3.0
 @numba.njit(cache=True, nogil=True)
 def fill_rows(
     x_px: Float32, confidence: Float32, x_sd_px: Float32, min_confidence: float, plane: Float64, u: Float32, v: Float32,
-    inverse_depth: Float32, depth_confidence: Float32, commands: Float64, command: Float64,
+    inverse_depth: Float32, depth_confidence: Float32, inverse_depth_sd: Float32, commands: Float64, command: Float64,
 ) -> None:  # fmt: skip
-    """Write inverse depth and its confidence (rows, width) for pixels between stripes of neighbouring columns.
+    """Write inverse depth, its confidence and its standard deviation (rows, width) for pixels between stripes of
+    neighbouring columns. Other pixels keep what the arrays hold; confidence must begin below 0.
 
     Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
@@ -61,6 +68,7 @@ def fill_rows(
                 if not abs(xb - xa + turn / slope) <= SPACING_TOLERANCE_PX + SPACING_SIGMAS * sd:
                     continue
                 sure = min(confidence[y, c], confidence[y, other])
+                sd_a, sd_b = abs(slope) * x_sd_px[y, c], abs(slope) * x_sd_px[y, other]
                 for x in range(max(int(np.ceil(min(xa, xb))), 0), min(int(np.floor(max(xa, xb))), width - 1) + 1):
                     if not sure > depth_confidence[y, x]:
                         continue
@@ -72,9 +80,30 @@ def fill_rows(
                     if w > 1e-6:
                         inverse_depth[y, x] = w
                         depth_confidence[y, x] = sure
+                        inverse_depth_sd[y, x] = np.sqrt(((1.0 - f) * sd_a) ** 2 + (f * sd_b) ** 2)
                         if command.size:
                             command[y, x] = (1.0 - f) * commands[c] + f * commands[other]
                 break
+
+
+@numba.njit(cache=True, nogil=True)
+def depth_rows(
+    inverse_depth: Float32, lowest: np.float32, highest: np.float32, depth_m: Float32, confidence: Float32,
+    sd_m: Float32,
+) -> None:  # fmt: skip
+    """Write depth (rows, width) in metres of inverse depths from `lowest` to `highest`; elsewhere NaN, with confidence
+    0. sd_m: holds the standard deviation of inverse depth, and becomes that of depth."""
+    for y in range(inverse_depth.shape[0]):
+        for x in range(inverse_depth.shape[1]):
+            w = inverse_depth[y, x]
+            if lowest <= w <= highest:
+                z = np.float32(1.0) / w
+                depth_m[y, x] = z
+                sd_m[y, x] *= z * z
+            else:
+                depth_m[y, x] = np.nan
+                confidence[y, x] = 0.0
+                sd_m[y, x] = np.nan
 
 
 SUMS: Final = 4

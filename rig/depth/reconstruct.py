@@ -14,8 +14,8 @@ from calibration.model.rig_model import RigModel
 from rig.config.models import EstimateConfig
 from rig.count.map_checks import MapChecks
 from rig.count.volume import Counter, FrameTally, LineCounter, SweepLayout
-from rig.depth.depth import depth_map, share_claims
-from rig.depth.floating import without_floating
+from rig.depth.depth import DepthMap, depth_map, share_claims
+from rig.depth.floating import floating_points
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
 from rig.estimate.registry import COUPLED, LEARNING, Learned, ManyMaps, create_estimator, recalling
@@ -28,8 +28,10 @@ from rig.threads import RowWorkers
 
 @dataclass(frozen=True, slots=True)
 class MapResult:
-    """One reconstructed map: stripe table, depth_m (rows, width) float32 with NaN, intensity (rows, width) uint32.
+    """One reconstructed map: stripe table, depth, intensity (rows, width) uint32, fog.
 
+    depth_m, confidence, depth_sd_m: float32 (rows, width), as in `rig.depth.depth.DepthMap`: NaN, 0 and NaN where there
+    is no depth, which is everywhere without a calibration.
     compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
     nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`). floating:
     number of points left out because they float between two surfaces; None if such points are kept, or without depth.
@@ -37,6 +39,8 @@ class MapResult:
 
     stripe: StripeTable
     depth_m: Float32
+    confidence: Float32
+    depth_sd_m: Float32
     intensity: NDArray[np.uint32]
     fog: FogEstimate
     compute_s: float
@@ -200,13 +204,14 @@ class Reconstructor:
             stripe = median_filter(stripe, geometry.reference_px(), coupled=self._coupled)
         floating: int | None = None
         if self._model is None:
-            depth = np.full((geometry.rows, geometry.width), np.nan, np.float32)
+            depth = DepthMap.empty(geometry.rows, geometry.width)
         else:
             depth = depth_map(stripe, geometry, self._min_confidence, workers)
             if not self._keep_floating:
-                depth, floating = without_floating(depth, geometry.px_per_inverse_depth(), workers)
+                floats = floating_points(depth.depth_m, geometry.px_per_inverse_depth(), workers)
+                depth, floating = depth.without(floats), int(np.count_nonzero(floats))
         compute_s = time.perf_counter() - begun
-        return MapResult(stripe, depth, intensity, fog, compute_s, used, doubts, floating)
+        return MapResult(stripe, *depth, intensity, fog, compute_s, used, doubts, floating)
 
     def _bound(self, sweep: FrameTally) -> SweepGeometry:
         """Geometry with the planes at which the frames of each column were actually taken."""

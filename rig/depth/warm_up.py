@@ -8,7 +8,7 @@ from rig.count.bind import FrameBinder
 from rig.count.map_checks import MapChecks
 from rig.count.volume import BIN_DARK, CountVolume, SweepLayout
 from rig.depth.depth import depth_map
-from rig.depth.floating import without_floating
+from rig.depth.floating import floating_points
 from rig.depth.fog_meter import read_fog
 from rig.estimate.registry import COUPLED, create_estimator
 from rig.estimate.row.model import RowModel
@@ -57,7 +57,7 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
         from rig.estimate.median import median_filter
 
         stripe = median_filter(stripe, geometry.reference_px(), coupled=estimator in COUPLED)
-    without_floating(depth_map(stripe, geometry, 0.5), geometry.px_per_inverse_depth())
+    floating_points(depth_map(stripe, geometry, 0.5).depth_m, geometry.px_per_inverse_depth())
 
 
 def warm_binding(plan: ScanPlan) -> None:

@@ -56,7 +56,7 @@ def depth_with_floating(reconstructor: Any, result: Any) -> NDArray[np.float32]:
     """The depth map of a MapResult of this reconstructor before points that float were left out."""
     from rig.depth.depth import depth_map
 
-    return np.asarray(depth_map(result.stripe, reconstructor.geometry, 0.5))
+    return np.asarray(depth_map(result.stripe, reconstructor.geometry, 0.5).depth_m)
 
 
 def volume_of(reconstructor: Any, counts: NDArray[np.unsignedinteger], exposures: int) -> Any:

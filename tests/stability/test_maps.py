@@ -14,7 +14,7 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.count.volume import BIN_DARK, CountVolume, FrameTally, SweepCounter, SweepLayout, SweepTally, with_room
 from rig.depth.depth import depth_map
-from rig.depth.kernels import fill_rows
+from rig.depth.kernels import depth_rows, fill_rows
 from rig.errors import UsageError
 from rig.estimate.median import median_filter
 from rig.estimate.registry import ESTIMATORS, create_estimator
@@ -64,7 +64,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
     assert np.all(w[inside] >= (1 / (near * ratio) - slack)[inside])
 
 
-@covers(depth_map, fill_rows, StripeTable, median_filter)
+@covers(depth_map, depth_rows, fill_rows, StripeTable, median_filter)
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6),
@@ -85,12 +85,16 @@ def test_depth_lies_in_the_depth_range_or_there_is_none(seed, spread, missing, s
     for answer in (table, median_filter(table, geometry.reference_px())):
         np.testing.assert_array_equal(np.isnan(answer.x_px), np.isnan(table.x_px))
         assert np.all((answer.confidence >= 0) & (answer.confidence <= 1 + 1e-6))
-        depth = depth_map(answer, geometry, 0.5)
+        depth, confidence, sd_m = depth_map(answer, geometry, 0.5)
         near, far = geometry.depth_range_m
         seen = np.isfinite(depth)
         assert not np.isinf(depth).any()
         assert np.all((depth[seen] > 0.9 * near) & (depth[seen] < far / 0.89))
-    assert np.isnan(depth_map(empty, geometry, 0.5)).all()
+        assert np.all(confidence[seen] >= 0.5)
+        assert np.all(confidence[~seen] == 0)
+        np.testing.assert_array_equal(np.isfinite(sd_m), seen)
+        assert np.all(sd_m[seen] >= 0)
+    assert np.isnan(depth_map(empty, geometry, 0.5).depth_m).all()
 
 
 @covers(stripe_errors, depth_errors, charged_errors)

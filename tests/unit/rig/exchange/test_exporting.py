@@ -15,6 +15,7 @@ import pytest
 from drivers.frames import FrameBlock, Mark
 from drivers.recorded import RunRecording
 from rig.api import export_run, import_frames
+from rig.depth.depth import DepthMap
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.errors import DamagedRecordingError, UsageError
 from rig.geometry.stripe_table import StripeTable
@@ -44,7 +45,8 @@ def mapped(tmp_path: Path) -> Path:
             depth = np.full((7, 9), 2.0 + index, np.float32)
             depth[0, 0] = np.nan
             intensity = np.full((7, 9), 40 * index, np.uint32)
-            folder.write_map(index, MapResult(StripeTable.empty(7, 4), depth, intensity, FogEstimate(), 0.1), rays)
+            known = DepthMap(depth, np.isfinite(depth).astype(np.float32), depth / 100)
+            folder.write_map(index, MapResult(StripeTable.empty(7, 4), *known, intensity, FogEstimate(), 0.1), rays)
         return folder.publish()
 
 

@@ -114,7 +114,7 @@ def test_maps_and_windows_follow_the_traced_light(light: dict) -> None:
         at = np.round(stripes[y, c])
         held = (geometry.x_lo[y, c] <= at + 1) & (at - 1 <= geometry.x_hi[y, c])
         assert held[in_range].all()
-        depth = depth_map(table(stripes), geometry, 0.5)[rows]
+        depth = depth_map(table(stripes), geometry, 0.5).depth_m[rows]
         known = np.isfinite(depth)
         assert known.mean() > 0.3
         truth = wall_m(u, v, distance_m)[rows]

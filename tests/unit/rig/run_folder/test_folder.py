@@ -11,6 +11,7 @@ import pytest
 
 from drivers.interfaces import SweepTruth
 from drivers.recorded import RunRecording
+from rig.depth.depth import DepthMap
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.geometry.stripe_table import StripeTable
 from rig.recording.writer import Recording
@@ -26,7 +27,8 @@ def a_map(depth: float = 2.0) -> MapResult:
     depth_m[:, 30:] *= 2
     depth_m[5:9, 10:20] = np.nan
     intensity = np.arange(ROWS * WIDTH, dtype=np.uint32).reshape(ROWS, WIDTH)
-    return MapResult(StripeTable.empty(ROWS, COLUMNS), depth_m, intensity, FogEstimate(None, None, None), 0.1)
+    known = DepthMap(depth_m, np.isfinite(depth_m).astype(np.float32), depth_m / 100)
+    return MapResult(StripeTable.empty(ROWS, COLUMNS), *known, intensity, FogEstimate(None, None, None), 0.1)
 
 
 def rays() -> tuple[np.ndarray, np.ndarray]:

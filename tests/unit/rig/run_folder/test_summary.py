@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import SweepTruth
+from rig.depth.depth import DepthMap
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.devices.open import light_problems
 from rig.errors import UsageError
@@ -20,8 +21,8 @@ from rig.run_folder.summary import MapTally, RunFrames, RunVerdict
 def a_map(x: float, fog: FogEstimate | None = None) -> MapResult:
     stripe = StripeTable.empty(2, 4)
     stripe.x_px[:, :3] = x
-    depth = np.array([[2.0, np.nan], [2.0, 2.0]], np.float32)
-    return MapResult(stripe, depth, np.zeros((2, 2), np.uint32), fog or FogEstimate(None, None, None), 0.1)
+    depth = DepthMap.empty(2, 2)._replace(depth_m=np.array([[2.0, np.nan], [2.0, 2.0]], np.float32))
+    return MapResult(stripe, *depth, np.zeros((2, 2), np.uint32), fog or FogEstimate(None, None, None), 0.1)
 
 
 TRUTH = SweepTruth(np.full((2, 4), 10, np.float32), np.full((2, 2), 2.5, np.float32))

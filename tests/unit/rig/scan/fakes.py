@@ -153,9 +153,9 @@ class FakeMaker:
         self.before(len(self.volumes))
         self.volumes.append(volume)
         empty = np.zeros((1, 1), np.float32)
-        return MapResult(
-            StripeTable.empty(1, 1), empty, empty.astype(np.uint32), FogEstimate(None, None, None), 1e-3, None
-        )
+        depth = empty, empty, empty
+        fog = FogEstimate(None, None, None)
+        return MapResult(StripeTable.empty(1, 1), *depth, empty.astype(np.uint32), fog, 1e-3, None)
 
 
 def fake_rig(plan, streams, failing=None, power=None, **spad):

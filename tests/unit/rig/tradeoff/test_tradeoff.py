@@ -158,7 +158,7 @@ def test_missing_answers_are_charged_and_repeats_averaged():
     x_px = np.array([[10.5, 45, 7, np.nan]], np.float32)
     stripe = StripeTable(x_px, none, none, none, none)
     depth_m = np.array([[2.01, 1.97, np.nan, np.nan]], np.float32)
-    result = MapResult(stripe, depth_m, none.astype(np.uint32), FogEstimate(None, None, None), 0.0)
+    result = MapResult(stripe, depth_m, none, none, none.astype(np.uint32), FogEstimate(None, None, None), 0.0)
     score = score_map(("street", "clear"), TrialSetting("edge", "none", 10), result, truth, 50.0, 20.0)
     assert score.mean_abs_px == pytest.approx((0.5 + 25 + 10) / 3)
     assert (score.within_1px, score.missing) == (pytest.approx(1 / 3), pytest.approx(1 / 3))
