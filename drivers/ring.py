@@ -78,6 +78,11 @@ class BlockRing:
         return self._on_full is OnFull.WAIT
 
     @property
+    def used(self) -> int:
+        """Number of slots that are not free at this moment. May be called from any thread."""
+        return self.slots - len(self._free)
+
+    @property
     def full(self) -> bool:
         """Whether there is no free slot at this moment."""
         return not self._free
@@ -209,6 +214,9 @@ class RingReader:
         self.holds = holds
         self.skipped = 0
         """Blocks an optional reader did not get."""
+        self.idle = False
+        """Whether an optional reader is offered no blocks at present, and so occupies no slot; these do not count as
+        skipped. Any thread may set it."""
         self._ring = ring
         self._waiting: deque[tuple[int, FrameBlock]] = deque()
         self._held: deque[int] = deque()
@@ -261,7 +269,7 @@ class RingReader:
 
     def _offer(self, slot: int, block: FrameBlock) -> bool:
         """Take the block unless this reader has to skip it; returns whether it did. The ring's lock is held."""
-        if self._closed:
+        if self._closed or self.idle:
             return False
         if not self.required:
             if self._held:

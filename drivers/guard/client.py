@@ -68,7 +68,8 @@ class GuardedLaser(_Guarded, LineLaser):
         return bool(self._about["gate_only"])
 
     def _do_status(self) -> LaserStatus:
-        return LaserStatus(**self._ask("status"))
+        self._guard.laser_status = LaserStatus(**self._ask("status"))
+        return self._guard.laser_status
 
     def _check_health(self) -> None:
         """Do nothing: `arm` in the guard checks already, and a slow laser need not be asked twice."""
@@ -173,6 +174,8 @@ class Guard:
         self.changed: list[str] = []
         """The laser's settings that the guard has changed (`LineLaser.changed`), as far as it has told."""
         self._answer_s = ANSWER_S | {"arm": ANSWER_S["arm"] + getattr(laser, "warm_up", 0.0)}
+        self.laser_status: LaserStatus | None = None
+        """The laser's last report. The guard asks an armed laser every second and tells; to read this asks nothing."""
         self.failure: DeviceError | None = None
         """The reason why the guard switched the light off, or `GuardLost`; None while all is well."""
         self._lost = threading.Event()
@@ -353,6 +356,8 @@ class Guard:
             self._opened[message["opened"]] = message
             self.changed = message.get("about", {}).get("changed", self.changed)
             self._opening[message["opened"]].set()
+        elif "laser_status" in message:
+            self.laser_status = LaserStatus(**message["laser_status"])
         elif "tripped" in message:
             self.failure = error_from(message["tripped"])
         elif "id" in message:

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -287,6 +288,7 @@ class GuardProcess:
                 if attempt:
                     self._trip(error)
                 continue
+            self._channel.send({"laser_status": asdict(status)})
             if status.interlock_closed is False:
                 self._trip(InterlockOpen(f"{device.name}: the interlock is open; close it and start again"))
             elif status.fault is not None:

@@ -162,7 +162,8 @@ class Acquisition:
         ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
         on_frame = None if rig.guard is None else rig.guard.beat
-        pipeline = Pipeline(rig.spad, ring, work, asked.recording, self._listeners.monitor, on_frame)
+        told = self._listeners
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, told.monitor, on_frame, told.watched)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
@@ -253,8 +254,9 @@ class Acquisition:
         stages = self.stages
         lost = self.counters.lost
         lost = stages.dropped_frames if lost is None else lost
+        stage, used = self._stage(sweeps), 0 if self._pipeline is None else self._pipeline.ring_used
         self._listeners.tell(
-            ScanProgress(frames, planned, lost, sweeps, self._asked.maps, stages, self._fog, self._stage(sweeps))
+            ScanProgress(frames, planned, lost, sweeps, self._asked.maps, stages, self._fog, stage, used)
         )
 
     def _stage(self, sweeps: int) -> str:

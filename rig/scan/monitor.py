@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,14 @@ from drivers.frames import FrameBlock
 from drivers.ring import RingReader
 from rig.count.sweeps import SweepData
 from rig.depth.fog_meter import FogEstimate
+from rig.devices.open import OpenRig
+from rig.geometry.windows import SweepGeometry
+from rig.plan.scan_plan import ScanPlan
 from rig.progress import tell_stage
 from rig.recording.replay import ENDLESS
 from rig.recording.segment import Space
 from rig.run_folder.summary import PipelineStats
+from rig.scan.counting import AcquiredMap
 from rig.threads import StageThread
 
 _log = logging.getLogger(__name__)
@@ -64,7 +69,7 @@ class ScanProgress:
     marker to the last.
     lost: frames lost by the SPAD's own count; if it has none, those that found no room in the ring.
     sweeps: sweeps counted, of `maps`.
-    stages: the figures of each stage so far.
+    stages: the figures of each stage so far. ring_used: slots of the ring in use at this moment.
     fog: estimate from the newest map; None before the first.
     stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while other maps are made
       and nothing is counted; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
@@ -78,6 +83,19 @@ class ScanProgress:
     stages: PipelineStats
     fog: FogEstimate | None = None
     stage: str = "scanning"
+    ring_used: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunBegun:
+    """A run that is about to start: its devices are open, its plan and estimator known. folder: None if none is
+    written."""
+
+    rig: OpenRig
+    plan: ScanPlan
+    geometry: SweepGeometry
+    maps: int
+    folder: Path | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,15 +103,20 @@ class Listeners:
     """Callbacks of a run; None for no callback.
 
     live: called with the progress several times a second, on the caller's thread.
-    monitor: called with the newest frames, on a separate thread.
+    monitor: called with the newest frames, on a separate thread, while `watched` says so; None: always.
     sweeps: called with each counted sweep before its map is made, on the counting thread.
     on_space: called with the room that a recording will take, before anything moves, once it is known to fit.
+    begun: called once, on the caller's thread, before anything is compiled or moves.
+    maps: called with each map once it is written and counted, on the caller's thread.
     """
 
     live: Callable[[ScanProgress], None] | None = None
     monitor: MonitorCallback | None = None
     sweeps: Callable[[SweepData], None] | None = None
     on_space: Callable[[Space], None] | None = None
+    watched: Callable[[], bool] | None = None
+    begun: Callable[[RunBegun], None] | None = None
+    maps: Callable[[AcquiredMap], None] | None = None
 
     def tell(self, now: ScanProgress) -> None:
         """Report to `rig.progress` and `live` how far a scan is."""
@@ -110,10 +133,21 @@ NOBODY = Listeners()
 
 
 class Monitor:
-    """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives."""
+    """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives.
 
-    def __init__(self, reader: RingReader, callback: MonitorCallback, stats: Callable[[], PipelineStats]) -> None:
+    watched: tells whether anybody looks; meanwhile nothing is summed and no slot of the ring is occupied. None: always.
+    """
+
+    def __init__(
+        self,
+        reader: RingReader,
+        callback: MonitorCallback,
+        stats: Callable[[], PipelineStats],
+        watched: Callable[[], bool] | None = None,
+    ) -> None:
         self._reader = reader
+        self._watched = watched
+        reader.idle = watched is not None
         self._callback = callback
         self._stats = stats
         self._over = threading.Event()
@@ -121,6 +155,11 @@ class Monitor:
         self.updates = 0
         self.failed = False
         """Whether the callback raised."""
+
+    @property
+    def unwatched(self) -> bool:
+        """Whether nobody has looked so far."""
+        return self._watched is not None and not self.updates
 
     @property
     def skipped(self) -> int:
@@ -138,7 +177,10 @@ class Monitor:
     def _run(self) -> None:
         with self._reader:
             try:
-                while not self._over.is_set() and self._show_next():
+                while not self._over.is_set():
+                    self._reader.idle = self._watched is not None and not self._watched()
+                    if not self._reader.idle and not self._show_next():
+                        break
                     self._over.wait(INTERVAL_S)
             except BaseException as error:  # an error of the callback is no reason to end a run
                 self.failed = True

@@ -37,7 +37,7 @@ MONITOR_S = 0.5
 class Pipeline:
     """The threads of one start of the SPAD, see the module. maps: the queue of maps to the caller.
 
-    recording: takes every block; None for no recorder. on_frame: as in `Source`.
+    recording: takes every block; None for no recorder. on_frame: as in `Source`. watched: as in `Monitor`.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class Pipeline:
         recording: Recording | None = None,
         monitor: MonitorCallback | None = None,
         on_frame: Callable[[int], None] | None = None,
+        watched: Callable[[], bool] | None = None,
     ) -> None:
         self._ring = ring
         self.maps = MapQueue(MAPS_AHEAD)
@@ -61,7 +62,7 @@ class Pipeline:
             self._recorder = Recorder(reader, recording, self.maps.end_stream)
         self._monitor: Monitor | None = None
         if monitor is not None:
-            self._monitor = Monitor(ring.reader("monitor", required=False), monitor, self.stats)
+            self._monitor = Monitor(ring.reader("monitor", required=False), monitor, self.stats, watched)
         self.monitor_lost = False
         """Whether the monitor's callback raised or was left behind: it must not be called again."""
 
@@ -69,6 +70,11 @@ class Pipeline:
     def estimating(self) -> bool:
         """Whether a map is being made at this moment. May be called from any thread."""
         return self._counting.estimating
+
+    @property
+    def ring_used(self) -> int:
+        """Slots of the ring in use at this moment. May be called from any thread."""
+        return self._ring.used
 
     def stats(self) -> PipelineStats:
         """The present figures. May be called from any thread."""
@@ -89,8 +95,8 @@ class Pipeline:
             recorder_s=None if recording is None else recording.busy_s,
             recorder_blocks=None if recording is None else recording.blocks,
             recorder_bytes=None if recording is None else recording.bytes,
-            monitor_updates=None if monitor is None else monitor.updates,
-            monitor_skipped_blocks=None if monitor is None else monitor.skipped,
+            monitor_updates=None if monitor is None or monitor.unwatched else monitor.updates,
+            monitor_skipped_blocks=None if monitor is None or monitor.unwatched else monitor.skipped,
         )
 
     def start(self) -> None:

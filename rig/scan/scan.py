@@ -20,6 +20,7 @@ from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
 from drivers.spb1 import BlockLayout, frames_per_block
+from rig.config.files import portable_content
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
 from rig.depth.reconstruct import Reconstructor, map_geometry
@@ -37,11 +38,11 @@ from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
 from rig.recording.replay import RecordedStart, ReplayFacts
 from rig.recording.segment import Space, paged
-from rig.requests import RunRequest
+from rig.requests import RunRequest, request_content
 from rig.run_folder.folder import SavePolicy, write_learned
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
 from rig.scan.estimator import choose_estimator, foreseen_estimator, kept_model
-from rig.scan.monitor import NOBODY, Listeners
+from rig.scan.monitor import NOBODY, Listeners, RunBegun
 from rig.scan.pipeline import FEWEST_SLOTS, Overload, require_policy
 from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_content, synchronisation_of, verdict_of
 
@@ -78,6 +79,7 @@ def run_scan(
         tell_stage(f"{estimate.estimator}: {why}")
     rig = replace(rig, config=rig.config.model_copy(update={"estimate": estimate}))
     run.tally.estimator, run.tally.estimator_why = estimate.estimator, why
+    run.tally.note, run.tally.tags = request.note or "", tuple(request.tags)
     facts: LiveFacts | ReplayFacts = LiveFacts(rig, plan, request.maps)
     if isinstance(rig.spad, ReplaySpad):
         facts = ReplayFacts(rig.spad, plan, request.maps, estimate, rig.model)
@@ -88,11 +90,13 @@ def run_scan(
         rig.model, plan.commands, geometry, estimate, learned=facts.learned, kept=kept, lines=plan.lines
     )
     run.rays = geometry.rays if rig.model is not None else None
+    if listeners.begun is not None:
+        listeners.begun(RunBegun(rig, plan, geometry, facts.maps, run.path))
     warm_up(estimate.estimator, estimate.filter, plan.exposures, dark=True)
     warm_binding(plan)
     manifest: dict[str, Any] = {
         "command": facts.command,
-        "config": rig.config.model_dump(mode="json"),
+        "config": portable_content(rig.config),
         "plan": plan_content(plan),
         "calibration": None if calibration is None else calibration.content(),
         "rig": rig_content(here),
@@ -100,6 +104,9 @@ def run_scan(
         "seed": rig.seed,
         "maps": facts.maps,
         "on_overload": policy.value,
+        "request": request_content(request),
+        "note": request.note,
+        "tags": list(request.tags),
     }
 
     def write_beside(folder: Path) -> None:
@@ -135,6 +142,8 @@ def run_scan(
                     run.tally.learned = told[0] if used else told[1]
                 sweeps.append(found.sweep)  # before its map: whatever ends the run, no map is without its account
                 run.add(found.result, found.compute_s, truth)
+                if listeners.maps is not None:
+                    listeners.maps(found)
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
