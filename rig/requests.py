@@ -50,6 +50,14 @@ def described(request: type[Request]) -> type[Request]:
     return request
 
 
+def request_content(request: object) -> dict[str, Any]:
+    """The fields of a request as plain values, for the manifest. Paths become text; config, note and tags have keys of
+    their own there, and the folder is the run's own."""
+    left_out = ("out", "config", "note", "tags")
+    values = {each.name: getattr(request, each.name) for each in options_of(type(request)) if each.name not in left_out}
+    return {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
+
+
 # Fields that several requests have.
 
 
@@ -100,6 +108,8 @@ class RunRequest(ReconstructRequest):
     record: bool = option(False, "write the frames into the folder too")
     on_overload: str = option("abort", "where frames come too fast: abort, drop (and count) or block (wait)")
     arm: bool = option(False, "let a real laser shine: the beam path is clear")
+    note: str | None = option(None, "text to keep with the run, for people", unset="none")
+    tags: Sequence[str] = option((), "words to find the run by, separated by commas", unset="none", name="tag")
 
 
 @described
@@ -171,6 +181,22 @@ class SoakRequest:
     on_overload: str = option("abort", "where frames of the stream come too fast: abort, drop or block")
     estimator: str = option("likelihood", "of the stream: argmax, edge, likelihood or joint")
     exposures: int | None = option(None, "frames per column of the stream", unset="10", least=1)
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunsRequest:
+    """Which runs of a folder to list (`rig runs`). A run is listed if it passes every filter that is given."""
+
+    tags: Sequence[str] = option((), "with all of these tags, separated by commas", unset="any", name="tag")
+    note: str | None = option(None, "with this text in the note, in capital or small letters", unset="any")
+    verdict: str | None = option(None, "of this verdict, such as complete, gaps or damaged", unset="any")
+    since: str | None = option(
+        None, "taken since a date '2025-11-29', a time '2025-11-29 14:00' or '7 d' ago", unset="any"
+    )
+    config: str | None = option(None, "of the rig with this name in its config", unset="any")
+    scene: str | None = option(None, "of this scene (simulated rigs)", unset="any")
+    estimator: str | None = option(None, "estimated with this one", unset="any")
 
 
 @described

@@ -26,6 +26,7 @@ from rig.recording.replay import replay_config
 from rig.recording.segment import Space
 from rig.requests import ReconstructRequest, ReplayRequest, RunRequest, ScanRequest
 from rig.run_folder.folder import SavePolicy
+from rig.run_folder.runs import label_problems
 from rig.run_folder.summary import MapTally
 from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
 from rig.scan.pipeline import Overload, require_policy
@@ -182,6 +183,7 @@ def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:
         problems.append(f"maps is {request.maps}; it must be at least 1")
     if isinstance(request, ScanRequest):
         problems += seed_problems(request.seed)
+    problems += label_problems(request.note, request.tags)
     save = SavePolicy()
     with noted(problems):
         save = SavePolicy.parse(request.save or "all")

@@ -1,4 +1,7 @@
-"""Commands for recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import`, `export` and `replay`."""
+"""Commands for runs (`rig runs`) and recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import`, ...
+
+Also `rig export` and `rig replay`.
+"""
 
 import os
 import select
@@ -11,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, api, asks, report, say, say_space
+from rig.cli.command import Answer, Commands, api, asks, report, say, say_space, tables
 from rig.cli.progress import progress
-from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest
+from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest, RunsRequest
 
 if TYPE_CHECKING:
     from drivers.replay.pace import Pace
@@ -121,6 +124,19 @@ def _megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB"
 
 
+@asks(RunsRequest)
+def runs_command(
+    request: RunsRequest,
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="where the runs lie, up to three levels below", show_default=True)
+    ] = Path("runs"),
+) -> Answer:
+    """List the runs in a folder, the newest last: when, what, with which verdict, note, tags and size."""
+    found = api.runs(folder, request)
+    content = {"runs": [{**asdict(entry), "taken": f"{entry.taken:%Y-%m-%dT%H:%M:%SZ}"} for entry in found]}
+    return Answer(content, lambda: tables.runs_table(found))
+
+
 @asks(ImportRequest)
 def import_command(
     request: ImportRequest,
@@ -205,6 +221,7 @@ def _follow(pace: "Pace", handle: int) -> None:
 
 
 COMMANDS: Commands = {
+    "runs": runs_command,
     "verify": verify_command,
     "repair": repair_command,
     "info": info_command,

@@ -9,9 +9,11 @@ import typer
 from rig.cli.command import EXIT_ABORTED, Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
 from rig.cli.completion import one_of
 from rig.cli.progress import progress
-from rig.requests import ReconstructRequest, ScanRequest, TradeoffRequest
+from rig.errors import UsageError
+from rig.requests import ReconstructRequest, ScanRequest, TradeoffRequest, options_of
 
 if TYPE_CHECKING:
+    from rig.config.models import RigConfig
     from rig.plan.scan_plan import ScanPlan
     from rig.recording.segment import Space
 
@@ -19,17 +21,30 @@ if TYPE_CHECKING:
 @asks(ScanRequest)
 def scan_command(
     request: ScanRequest,
+    context: typer.Context,
     config: ConfigArgument = "simulated",
+    like: Annotated[
+        Path | None,
+        typer.Option("--like", metavar="RUN", help="repeat this run; options given here differ", show_default=False),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
 ) -> Answer:
     """Acquire and reconstruct depth maps."""
+    rig: str | RigConfig = config
+    if like is not None:
+        given = {name for name in context.params if str(context.get_parameter_source(name)).endswith("COMMANDLINE")}
+        if "config" in given:
+            raise UsageError(f"--like {like} has a config of its own; leave '{config}' out, or --like")
+        rig, asked = api.repeat(like)
+        named = {each.name for each in options_of(ScanRequest)} & {*given, "out"}
+        request = replace(asked, **{name: getattr(request, name) for name in named})
     if dry_run:
         spaces: list[Space] = []
         estimator: list[str] = []
-        plan = api.plan_scan(config, request, on_space=spaces.append, on_estimator=estimator.append)
+        plan = api.plan_scan(rig, request, on_space=spaces.append, on_estimator=estimator.append)
         return _of_plan(plan, estimator[0], spaces[0] if spaces else None)
     with progress():
-        result = api.scan(config, request, on_space=say_space)
+        result = api.scan(rig, request, on_space=say_space)
     return report(result)
 
 

@@ -4,6 +4,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import groupby
+from pathlib import PurePath
 from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
@@ -15,6 +16,7 @@ from rig.bench.frames import COLUMNS
 from rig.bench.soak import SoakReport
 from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
 from rig.cli.command import in_options
+from rig.run_folder.runs import DAMAGED, RunEntry
 from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
 from rig.scan.run import RunResult
 from rig.tradeoff.effects import Effect, Flux, SceneEffects
@@ -150,6 +152,8 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     frames = summary.frames
     estimator = summary.estimator + (f" ({summary.estimator_why})" if summary.estimator_why else "")
     rows = [
+        *((("note", _one_line(summary.note)),) if summary.note else ()),
+        *((("tags", ", ".join(summary.tags)),) if summary.tags else ()),
         ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {estimator}"),
         *((("learned", summary.learned),) if summary.learned else ()),
         ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
@@ -226,6 +230,44 @@ def _percent(value: float | None) -> str:
 def _filled(summary: Summary) -> str:
     left_out = f"; {summary.floating_points:.0f} that float are left out" if summary.floating_points else ""
     return f"{_percent(summary.valid_fraction)} of the pixels have a depth{left_out}"
+
+
+_RUNS: Columns[RunEntry] = (
+    ("taken", lambda run: f"{run.taken.astimezone():%Y-%m-%d %H:%M:%S}"),
+    ("run", lambda run: str(run.folder)),
+    ("verdict", lambda run: run.verdict),
+    ("maps", lambda run: "-" if run.maps is None else str(run.maps)),
+    ("config", lambda run: run.config or "-"),
+    ("scene", lambda run: PurePath(run.scene).name or "-"),
+    ("estimator", lambda run: run.estimator or "-"),
+    ("K", lambda run: "-" if run.exposures is None else str(run.exposures)),
+    ("size", lambda run: ("rec " if run.recorded else "") + _size(run.bytes)),
+    ("tags", lambda run: ", ".join(run.tags)),
+    ("note", lambda run: run.problem or _one_line(run.note)),
+)
+_NOTE_CHARACTERS = 60
+
+
+def runs_table(runs: Sequence[RunEntry]) -> None:
+    """Print a list of runs to stdout, one line each, in local time. `rec` before the size: with its recording."""
+    if not runs:
+        print("no run passes")
+        return
+    numbers = ("maps", "K", "size")
+    console(WIDE).print(_table(_RUNS, runs, left=[name for name, _ in _RUNS if name not in numbers], apart=2))
+    damaged = sum(run.verdict == DAMAGED for run in runs)
+    size = _size(sum(run.bytes for run in runs))
+    print(f"{len(runs)} runs, {size}" + (f", {damaged} damaged" if damaged else ""))
+
+
+def _size(count: int) -> str:
+    """A number of bytes in MB or GB, short enough for a table."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def _one_line(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _NOTE_CHARACTERS else f"{line[: _NOTE_CHARACTERS - 3]}..."
 
 
 WIDTH = 80

@@ -98,6 +98,9 @@ class _Manifest(_Part):
     cut: _Cut | None = None
     missing: list[Frames] | None = None
     repaired: list[Any] | None = None
+    request: Section = None
+    note: str | None = None
+    tags: list[str] | None = None
 
 
 def sealed_text(text: str) -> str:

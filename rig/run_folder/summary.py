@@ -137,7 +137,7 @@ class Summary:
     the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons
     against the calibration that the user accepted. estimator_why: why the run chose this estimator; empty if it was
     named. learned: if a file for learned states was named, whether the first map was estimated with the state in it,
-    and why if not; else empty.
+    and why if not; else empty. note, tags: given with the run, for people.
     """
 
     maps: int
@@ -162,6 +162,8 @@ class Summary:
     accepted_calibration: tuple[str, ...] = ()
     estimator_why: str = ""
     learned: str = ""
+    note: str = ""
+    tags: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values. `truth` and the fields after `verdict` are left out if empty or None."""
@@ -169,6 +171,7 @@ class Summary:
         content["verdict"] = self.verdict.value
         optional = (
             "truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why", "learned",
+            "note", "tags",
         )  # fmt: skip
         return {name: value for name, value in content.items() if value or name not in optional}
 
@@ -193,6 +196,8 @@ class MapTally:
     filter: str
     estimator_why: str = ""
     learned: str = ""
+    note: str = ""
+    tags: tuple[str, ...] = ()
     _maps: list[_OfMap] = field(default_factory=list)
 
     @property
@@ -256,6 +261,8 @@ class MapTally:
             accepted_calibration=accepted_calibration,
             estimator_why=self.estimator_why,
             learned=self.learned,
+            note=self.note,
+            tags=self.tags,
         )
 
 
