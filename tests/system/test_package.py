@@ -82,7 +82,7 @@ def test_the_installed_program_finds_its_configs_kinds_and_itself_from_any_folde
     listed = json.loads(run(rig, "scenes", "--json", folder=tmp_path).stdout)
     assert {"lab", "lab-emulated", "simulated"} <= {one["name"] for one in listed["rigs"]}
     assert "street" in {one["name"] for one in listed["scenes"]}
-    for name in ("lab", "lab-emulated", "hil", "simulated-4-lines"):
+    for name in ("lab", "lab-emulated"):
         checked = run(rig, "config", "check", name, folder=tmp_path)
         assert (checked.returncode, checked.stderr) == (0, ""), name
     schema = json.loads(run(rig, "config", "schema", folder=tmp_path).stdout)
