@@ -201,6 +201,20 @@ class RunsRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ViewRequest:
+    """A page in the browser that shows a run (`rig view`)."""
+
+    host: str = option("127.0.0.1", "address to listen on; 0.0.0.0 is the whole network, with a token")
+    port: int = option(8765, "to listen on; 0 takes any free one")
+    token: str | None = option(None, "that opens the page", unset="none on 127.0.0.1, else made anew")
+    open_browser: bool = option(False, "open the page in this computer's browser", name="open")
+    view_points: int = option(250_000, "most points of an update, at most 250000")
+    view_rate: float = option(10.0, "most updates a second, at most 10")
+    until_closed: bool = option(False, "end with the scan, once no page is open")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CutRequest:
     """A part of a recording (`rig cut`). Give exactly one of `maps`, `frames` and `time`."""
 

@@ -247,6 +247,11 @@ class SlotReader:
         """Whether the run is still going on: its process is there and has not closed the slot."""
         return not self._words[0] and process_there(self.slot.path, self.slot.pid)
 
+    @property
+    def ended(self) -> bool:
+        """Whether the run has said that it is over; a process that was killed says nothing."""
+        return bool(self._words[0])
+
     def read(self, section: str, newer_than: int = 0) -> Value | None:
         """The newest value of a section; None if it has none with a number above `newer_than`.
 
