@@ -9,6 +9,7 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
+from rig.config.estimators import estimator_names, is_estimator
 from rig.config.files import load_cube_plan
 from rig.config.models import AUTO, CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
@@ -16,7 +17,8 @@ from rig.devices.calibration_use import calibration_use, cube_calibration_use
 from rig.devices.open import light_problems, open_rig
 from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError, noted
-from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.estimate.registry import FILTERS
+from rig.live.feed import Feed
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.cube import open_cube
@@ -64,8 +66,8 @@ def scan(
     listeners = _listeners(progress, live, monitor, on_space)
     with _new_run(settings, request) as run:
         tap = run.start_tap() if request.record else None
-        with open_rig(settings, seed=request.seed, tap=tap) as rig:
-            return run_scan(rig, run, request, listeners)
+        with open_rig(settings, seed=request.seed, tap=tap) as rig, Feed("scan", settings.name) as feed:
+            return run_scan(rig, run, request, feed.listeners(listeners))
 
 
 def plan_scan(
@@ -138,8 +140,8 @@ def replay(
     if calibration is not None:
         settings = settings.model_copy(update={"calibration": Path(calibration)})
     listeners = _listeners(progress, live, monitor, on_space)
-    with _new_run(settings, request) as writer:
-        return play(settings, Path(run), writer, request, listeners, steps)
+    with _new_run(settings, request) as writer, Feed("replay", Path(run).name) as feed:
+        return play(settings, Path(run), writer, request, feed.listeners(listeners), steps)
 
 
 def _configured(config: Config, request: ScanRequest) -> RigConfig:
@@ -250,8 +252,9 @@ def _estimate(request: ReconstructRequest) -> EstimateConfig:
     estimator, filter = request.estimator or AUTO, request.filter or "none"
     min_confidence = 0.5 if request.min_confidence is None else request.min_confidence
     problems = []
-    if estimator not in (AUTO, *ESTIMATORS):
-        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join((AUTO, *ESTIMATORS))}")
+    if not is_estimator(estimator):
+        known = ", ".join((AUTO, *estimator_names()))
+        problems.append(f"estimator {estimator!r} is unknown; choose one of {known}")
     if filter not in FILTERS:
         problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
     if not 0 <= min_confidence <= 1:
