@@ -18,7 +18,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import bench, calibrate, devices, recordings, scan
+from rig.cli import bench, calibrate, devices, recordings, scan, view
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -38,6 +38,7 @@ for _commands in (
     devices.SCENES,
     recordings.COMMANDS,
     scan.COMMANDS,
+    view.COMMANDS,
     calibrate.COMMANDS,
     devices.COMMANDS,
     bench.COMMANDS,

@@ -128,7 +128,9 @@ class MapRows:
                 if assembler.complete:
                     assert isinstance(sweep.tally, _KeptFrames), "the keeper made it"
                     return sweep.tally
-        raise UsageError(f"the marker that ends map {number} of {self._recording.path} is gone; 'rig verify' tells more")
+        raise UsageError(
+            f"the marker that ends map {number} of {self._recording.path} is gone; 'rig verify' tells more"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

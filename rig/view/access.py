@@ -1,0 +1,143 @@
+"""Decides who may see the page: checks of Host, Origin and token, the same for the page, its files and its web sockets.
+
+A browser sends requests to the page on behalf of any page that it shows. Three things keep strangers out. `Host` must
+name this computer: a foreign page whose name its owner has pointed to this computer (DNS rebinding) still sends its own
+name. `Origin`, which browsers send with every web socket, must be the page's own. And where the page can be reached
+from other computers, a token is needed: first in the address, then in a cookie that scripts cannot read and that is not
+sent on behalf of other pages.
+"""
+
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+from urllib.parse import parse_qsl, urlsplit
+
+from rig.errors import UsageError
+
+FEWEST_TOKEN_CHARACTERS: Final = 16
+_TOKEN = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request, as far as it is checked. hosts, origins, cookies: values of these headers, one for each header sent.
+
+    path: with the query. socket: whether it asks for a web socket.
+    """
+
+    path: str
+    socket: bool
+    hosts: Sequence[str]
+    origins: Sequence[str]
+    cookies: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A request that is not answered. status: of HTTP. why: a sentence for the person at the browser."""
+
+    status: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """The rules of one page. address, port: where it listens. token: what those who ask must know; None for nobody.
+
+    names: host names under which the page may be asked for, beside numbers.
+    """
+
+    address: str
+    port: int
+    token: str | None
+    names: frozenset[str] = field(default_factory=frozenset)
+
+    @classmethod
+    def to(cls, host: str, port: int, token: str | None) -> "Access":
+        """The rules for a page at `host`, a name or an IP address. On an address other than loopback there is always a
+        token, made here if none is given. Raises UsageError for a token that could be guessed or has characters that do
+        not belong into an address, or for a host that is none of this computer."""
+        if token is not None and (_TOKEN.fullmatch(token) is None or len(token) < FEWEST_TOKEN_CHARACTERS):
+            raise UsageError(
+                f"`token` has {len(token)} characters; it needs at least {FEWEST_TOKEN_CHARACTERS}, of letters, digits, "
+                "'-' and '_'; leave it out, and one is made"
+            )
+        if not 0 <= port <= 65535:
+            raise UsageError(f"`port` is {port}; it must be 1 to 65535, or 0 for any free one")
+        try:
+            address = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UsageError(
+                f"`host` is {host!r}, which is no address of this computer ({reason}); write 127.0.0.1 for this "
+                "computer alone, 0.0.0.0 for the whole network, or one of its addresses"
+            ) from None
+        if is_loopback(address):
+            return cls(address, port, token, frozenset({"localhost"}))
+        own = socket.gethostname().lower()
+        names = {"localhost", host.lower(), own, f"{own}.local", socket.getfqdn().lower()}
+        return cls(address, port, token or secrets.token_urlsafe(24), frozenset(names))
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie. Browsers do not tell ports apart, so it has the port in it."""
+        return f"spadrig-{self.port}"
+
+    def url(self, name: str | None = None) -> str:
+        """The page's address with its token. name: of the computer, if not the address that it listens on."""
+        host = name or self.address
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def refusal(self, asked: Asked) -> Refusal | None:
+        """Why a request is not answered; None if it is. `brings_token` says whether it comes with the token."""
+        if len(asked.hosts) != 1 or not self._is_here(asked.hosts[0]):
+            return Refusal(421, "This page answers only to this computer's own name or number.")
+        if len(asked.origins) > 1 or (asked.socket and not asked.origins):
+            return Refusal(403, "A web socket of this page is opened by the page itself alone.")
+        if asked.origins and asked.origins[0] != f"http://{asked.hosts[0]}":
+            return Refusal(403, "This page answers to no other page.")
+        if self.token is None or self._is_token(self._from_cookies(asked)) or self.brings_token(asked):
+            return None
+        return Refusal(
+            401, "This page needs a token. Open the whole address that 'rig view' printed, with ?token= at its end."
+        )
+
+    def brings_token(self, asked: Asked) -> bool:
+        """Whether a request that is no web socket has the right token in its address."""
+        if self.token is None or asked.socket:
+            return False
+        query = parse_qsl(urlsplit(asked.path).query)
+        return self._is_token([value for name, value in query if name == "token"])
+
+    def _is_token(self, given: Sequence[str]) -> bool:
+        assert self.token is not None, "asked for where there is one"
+        return any([hmac.compare_digest(value.encode(), self.token.encode()) for value in given[:4]])
+
+    def _from_cookies(self, asked: Asked) -> list[str]:
+        pairs = [pair.strip().partition("=") for line in asked.cookies for pair in line.split(";")]
+        return [value for name, _, value in pairs if name == self.cookie]
+
+    def _is_here(self, host: str) -> bool:
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
+        except ValueError:
+            return False
+        if name in self.names:
+            return True
+        try:
+            number = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        # A number is never a name that somebody else owns. On loopback even that is not left to chance.
+        return number.is_loopback or not is_loopback(self.address)
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only programs on this computer reach an IP address."""
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback

@@ -1,0 +1,108 @@
+"""Estimates one map of a recording again, with another estimator, in a process of its own.
+
+The page goes on meanwhile. The map's frames are cut from the recording into a temporary folder, so this takes as long
+for the last map of an hour as for the first.
+"""
+
+import multiprocessing
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+from rig.errors import UsageError
+
+_END_S: Final = 2.0
+"""Longest wait for the process to end when asked to, before it is killed."""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimationRequest:
+    """Map `number` of the recording `run`. by_cutting: whether its frames can be cut out; a recording without markers
+    is played from its beginning instead."""
+
+    run: Path
+    number: int
+    estimator: str
+    min_confidence: float
+    by_cutting: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """An estimate that is over. folder: of a run with the one map; None if it failed. number: of that map in it.
+    problem: why it failed. summary: of the run."""
+
+    request: EstimationRequest
+    folder: Path | None
+    number: int
+    problem: str
+    summary: Mapping[str, Any]
+
+
+class Estimation:
+    """An estimate under way; a context manager that ends it and removes its files."""
+
+    def __init__(self, request: EstimationRequest) -> None:
+        self.request = request
+        self._folder = Path(tempfile.mkdtemp(prefix="spadrig-view-"))
+        context = multiprocessing.get_context("spawn")  # threads of the server do not survive a fork
+        self._answer, theirs = context.Pipe(duplex=False)
+        self._process = context.Process(target=_estimate, args=(request, self._folder, theirs), daemon=True)
+        try:
+            self._process.start()
+        except OSError as error:
+            self.close()
+            raise UsageError(f"cannot start a process for the estimate: {error.strerror or error}") from error
+        theirs.close()
+
+    def poll(self) -> Estimated | None:
+        """The result once it is there, else None."""
+        if not self._answer.poll():
+            return None
+        try:
+            problem, number, summary = self._answer.recv()
+        except EOFError:
+            problem, number, summary = "the process that made it has died", 0, {}
+        return Estimated(self.request, None if problem else self._folder / "map", number, problem, summary)
+
+    def close(self) -> None:
+        """End the process, if it still runs, and remove its files."""
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join(_END_S)
+            if self._process.is_alive():
+                self._process.kill()
+        self._answer.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _estimate(request: EstimationRequest, folder: Path, answer: Connection) -> None:
+    """Runs in the process: makes folder/map and answers with problem, number of the map in it, and summary."""
+    from calibration.errors import CalibrationError
+    from drivers.errors import DeviceError
+    from rig import api
+    from rig.errors import RigError
+
+    # A page only looks: reasons against the calibration are those of the run, which it shows.
+    asked: dict[str, Any] = {
+        "estimator": request.estimator,
+        "min_confidence": request.min_confidence,
+        "accept_calibration": True,
+        "out": folder / "map",
+    }
+    try:
+        if request.by_cutting:
+            api.cut(request.run, folder / "part", maps=str(request.number))
+            result, number = api.reconstruct(folder / "part", **asked), 0
+        else:
+            result = api.replay(request.run, clock="max", maps=request.number + 1, save="last", **asked)
+            number = request.number
+        answer.send(("", number, result.summary.as_json()))
+    except (RigError, DeviceError, CalibrationError) as error:
+        answer.send((" ".join(str(error).split()) or type(error).__name__, 0, {}))
+    except KeyboardInterrupt:
+        answer.send(("interrupted", 0, {}))

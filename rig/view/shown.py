@@ -1,0 +1,181 @@
+"""One map as the page shows it: its points with colours, its pictures, and the figures of the pixel under the cursor."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.geometry.windows import evenly_spread
+from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
+from rig.simd import Bools, Float32
+
+COLOURS: Final = ("depth", "confidence", "signal", "counts")
+"""Values by which points are coloured."""
+NEAR_PX: Final = 3.0
+"""A stripe this close to the cursor is the one that is meant, if it is one of those that make the depth."""
+Limits = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownMap:
+    """A map. Arrays of pixels are (rows, width); each may be None if the run does not have it.
+
+    number: of the map in its run. depth_m, confidence, depth_sd_m: float32, as in `rig.depth.depth.DepthMap`. counts:
+    summed over the sweep, float32, NaN where unknown. picture_of_counts: the PNG file of them, if there is one. rays: (u, v), NaN
+    where unknown. stripe: arrays (rows, columns) of the stripe table. about: more about the map for the page.
+    """
+
+    number: int
+    stripe: Mapping[str, Float32]
+    depth_m: Float32 | None = None
+    confidence: Float32 | None = None
+    depth_sd_m: Float32 | None = None
+    counts: Float32 | None = None
+    picture_of_counts: bytes | None = None
+    rays: tuple[Float32, Float32] | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def kept(self, least_confidence: float) -> Bools | None:
+        """Pixels with a depth of at least this confidence; None without depth."""
+        if self.depth_m is None:
+            return None
+        known = np.isfinite(self.depth_m)
+        return known if self.confidence is None else known & (self.confidence >= np.float32(least_confidence))
+
+    def column_at(self, row: int, x: int) -> int | None:
+        """The column whose stripe is nearest to a pixel; None if the row has no stripe. Stripes that can have made the
+        depth are preferred if one is within NEAR_PX."""
+        x_px = self.stripe.get("x_px")
+        if x_px is None or not 0 <= row < len(x_px):
+            return None
+        away = np.abs(x_px[row] - np.float32(x))
+        if not np.isfinite(away).any():
+            return None
+        sure = self.stripe["confidence"][row] >= np.float32(self.about.get("min_confidence") or 0.5)
+        trusted = np.where(sure, away, np.inf)
+        best = int(np.nanargmin(trusted)) if np.isfinite(trusted).any() else -1
+        return best if best >= 0 and trusted[best] <= NEAR_PX else int(np.nanargmin(away))
+
+    def pixel(self, row: int, x: int) -> dict[str, float | None]:
+        """Depth, its error and confidence, and counts of a pixel; None for what is not known."""
+        found: dict[str, float | None] = {}
+        for name in ("depth_m", "depth_sd_m", "confidence", "counts"):
+            array = getattr(self, name)
+            inside = array is not None and 0 <= row < array.shape[0] and 0 <= x < array.shape[1]
+            value = float(array[row, x]) if inside else np.nan
+            found[name] = value if np.isfinite(value) else None
+        if found["depth_m"] is None:
+            found["confidence"] = None
+        return found
+
+    def stripe_at(self, row: int, column: int) -> dict[str, float | None]:
+        """The stripe table's values of one column on one row."""
+        values = {name: float(array[row, column]) for name, array in self.stripe.items()}
+        return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+    def signal(self) -> Float32 | None:
+        """Photons per exposure of the stripe nearest to each pixel with a depth, float32 (rows, width), else NaN."""
+        if self.depth_m is None or "signal" not in self.stripe:
+            return None
+        return at_pixels(self.stripe, "signal", self.depth_m, self.about.get("min_confidence"))
+
+
+def at_pixels(stripe: Mapping[str, Float32], name: str, depth_m: Float32, min_confidence: float | None) -> Float32:
+    """A value of the stripe table at each pixel with a depth, float32 (rows, width), else NaN: that of the nearest
+    stripe on its row with at least `min_confidence` (None: 0.5)."""
+    x_px, values = stripe["x_px"], stripe[name]
+    sure = np.isfinite(x_px) & (stripe["confidence"] >= np.float32(min_confidence or 0.5))
+    known = np.isfinite(depth_m)
+    out = np.full(depth_m.shape, np.nan, np.float32)
+    for row in np.flatnonzero(known.any(axis=1) & sure.any(axis=1)):
+        order = np.argsort(x_px[row, sure[row]])
+        places, pixels = x_px[row, sure[row]][order], np.flatnonzero(known[row])
+        nearest = np.searchsorted((places[1:] + places[:-1]) / 2, pixels)
+        out[row, pixels] = values[row, sure[row]][order][nearest]
+    return out
+
+
+class Points(NamedTuple):
+    """Points of a map. xyz_m: float32 (n, 3). rgb: uint8 (n, 3). of: their number before they were thinned. limits: the
+    values at the ends of the colour scale, None if there are none."""
+
+    xyz_m: Float32
+    rgb: NDArray[np.uint8]
+    of: int
+    limits: Limits | None
+
+
+def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits: Limits | None) -> Points | None:
+    """At most `most` points of a map, spread evenly over its pixels, in colours. None without depth or rays.
+
+    by: one of COLOURS; grey if the map has no such values. limits: of the colours of depth; None: those of the map.
+    """
+    kept = shown.kept(least_confidence)
+    if kept is None or shown.depth_m is None or shown.rays is None:
+        return None
+    u, v = shown.rays
+    pixels = np.flatnonzero(kept & np.isfinite(u) & np.isfinite(v))
+    chosen = pixels[evenly_spread(len(pixels), most)]
+    z = shown.depth_m.reshape(-1)[chosen]
+    xyz = np.stack([u.reshape(-1)[chosen] * z, v.reshape(-1)[chosen] * z, z], axis=1).astype(np.float32)
+    colours, limits = _colours(shown, by, chosen, limits)
+    return Points(xyz, colours, len(pixels), limits)
+
+
+def _colours(
+    shown: ShownMap, by: str, chosen: NDArray[np.int64], limits: Limits | None
+) -> tuple[NDArray[np.uint8], Limits | None]:
+    if by == "depth":
+        values = shown.depth_m
+        limits = limits or (None if values is None else depth_limits(values))
+    else:
+        values = {"confidence": shown.confidence, "signal": shown.signal(), "counts": shown.counts}[by]
+        limits = (0.0, 1.0) if by == "confidence" else None
+    if values is None:
+        return np.full((len(chosen), 3), 128, np.uint8), None
+    of_points = values.reshape(-1)[chosen].astype(np.float32)
+    if limits is None:
+        known = of_points[np.isfinite(of_points)]
+        low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
+        limits = float(low), float(high) if high > low else float(low) + 1.0
+    # The colours of the picture, so that both mean the same.
+    row = depth_picture(of_points[None, :], limits)[0, : len(chosen), ::-1]
+    return np.ascontiguousarray(row), limits
+
+
+def picture_of(shown: ShownMap, what: str, least_confidence: float, limits: Limits | None) -> bytes | None:
+    """A PNG of 'depth', 'counts' or 'confidence'; None if the map has no such values. Pixels begin at its left edge; a
+    scale may stand right of them."""
+    if what == "counts":
+        if shown.picture_of_counts is not None or shown.counts is None:
+            return shown.picture_of_counts
+        return png_bytes(intensity_picture(shown.counts.astype(np.uint32)))
+    kept = shown.kept(least_confidence)
+    values = shown.depth_m if what == "depth" else shown.confidence
+    if kept is None or values is None or not np.isfinite(shown.depth_m if shown.depth_m is not None else np.nan).any():
+        return None
+    values = np.where(kept, values, np.float32(np.nan))
+    if what == "depth":
+        return png_bytes(depth_picture(values, limits))
+    return png_bytes(depth_picture(values, (0.0, 1.0), ""))
+
+
+def ply_of(shown: ShownMap, least_confidence: float) -> bytes | None:
+    """All points of a map of at least this confidence as a PLY file; None without depth or rays."""
+    kept = shown.kept(least_confidence)
+    if kept is None or shown.depth_m is None or shown.rays is None:
+        return None
+    depth_m = np.where(kept, shown.depth_m, np.float32(np.nan))
+    counts = np.nan_to_num(shown.counts if shown.counts is not None else np.zeros(depth_m.shape)).astype(np.uint32)
+    return ply_bytes(cloud(depth_m, *shown.rays, counts))
+
+
+def steady_limits(before: Limits | None, depth_m: Float32 | None) -> Limits | None:
+    """Limits of the colours of depth: those before, while they still suit the map, so that colours do not flicker."""
+    now = None if depth_m is None else depth_limits(depth_m)
+    if before is None or now is None:
+        return now if before is None else before
+    allowed = 0.2 * (before[1] - before[0])
+    return before if abs(now[0] - before[0]) < allowed and abs(now[1] - before[1]) < allowed else now

@@ -1,0 +1,442 @@
+"""`rig view`: serves the page of a running scan or of a finished run, until it is interrupted.
+
+One thread, the caller's, holds all that is shown. It takes the wishes of the pages, looks for news, and tells the pages
+what has changed; the server's thread only passes messages on. All pages show the same map in the same colours.
+"""
+
+import os
+import threading
+import time
+import webbrowser
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+
+from drivers.errors import DeviceError
+from rig.config.estimators import estimator_names
+from rig.errors import RigError, UsageError
+from rig.recording.map_rows import RowCounts
+from rig.requests import ViewRequest
+from rig.view import health
+from rig.view.access import Access
+from rig.view.estimation import Estimated, Estimation, EstimationRequest
+from rig.view.live_source import LiveNews, LiveSource, LiveState
+from rig.view.pages import Pages, Wish
+from rig.view.run_source import RunSource, read_map
+from rig.view.server import ViewServer, listen, require_viser
+from rig.view.shown import COLOURS, Limits, ShownMap, picture_of, ply_of, points, steady_limits
+
+MOST_POINTS: Final = 250_000
+"""Most points of an update: 3.75 MB, at 15 bytes a point."""
+MOST_RATE_HZ: Final = 10.0
+_BEAT_S: Final = 0.1
+"""Longest wait from one look for news to the next."""
+_FOG_KEPT: Final = 600
+_NICE: Final = 10
+"""Priority below that of a scan on the same computer."""
+_PICTURES: Final = ("depth", "counts", "confidence")
+_NO_SCAN: Final = "No scan of yours is running on this computer. This page waits for one: rig scan"
+_STATES: Final = {
+    LiveState.WAITING: _NO_SCAN,
+    LiveState.LIVE: "",
+    LiveState.ENDED: "The scan has ended. This is its last map; the page waits for the next scan.",
+    LiveState.LOST: "The program that scanned is gone without an end. This is the last map that it showed.",
+}
+
+Ready = Callable[[str], None]
+"""Called with the page's address once it can be opened."""
+
+
+def view(
+    run: str | os.PathLike[str] | None, request: ViewRequest | None = None, *, ready: Ready, **changes: Any
+) -> None:
+    """Serve a page that shows a run (`rig view`), until an interrupt (Ctrl-C).
+
+    run: folder of a run, with or without recording; None shows the running scan, and waits for one.
+    request, changes: options, as a `ViewRequest` or by the names of its fields.
+    ready: called with the page's address, token included, once it can be opened.
+    Raises UsageError if there is nothing to show, viser is not installed, or the page cannot be served there.
+    """
+    request = replace(request or ViewRequest(), **changes)
+    _require_sizes(request)
+    require_viser()
+    source = LiveSource() if run is None else RunSource(Path(run))
+    with ExitStack() as stack:
+        shows: _ShowsLive | _ShowsRun
+        if isinstance(source, LiveSource):
+            stack.callback(source.close)
+            shows = stack.enter_context(_ShowsLive(request, source))
+        else:
+            shows = stack.enter_context(_ShowsRun(request, source))
+        url = shows.server.access.url()
+        ready(url)
+        if request.open_browser:
+            webbrowser.open(url)
+        with suppress(KeyboardInterrupt):
+            shows.serve()
+
+
+def _require_sizes(request: ViewRequest) -> None:
+    problems = []
+    if not 1 <= request.view_points <= MOST_POINTS:
+        problems.append(f"`view_points` is {request.view_points}; it must be at least 1 and at most {MOST_POINTS}")
+    if not 0 < request.view_rate <= MOST_RATE_HZ:
+        problems.append(
+            f"`view_rate` is {request.view_rate:g} a second; it must be above 0 and at most {MOST_RATE_HZ:g}"
+        )
+    if problems:
+        raise UsageError.of(problems)
+
+
+class _Shows:
+    """The common part of both: the server, the map that is shown, and how."""
+
+    def __init__(self, request: ViewRequest) -> None:
+        self._asked = request
+        self._wake = threading.Event()
+        self.pages = Pages(self._wake)
+        listening, access = listen(Access.to(request.host, request.port, request.token))
+        try:
+            self.server = ViewServer(access, listening, self.pages, self._download)
+        except BaseException:
+            listening.close()
+            raise
+        self._scene = self.server.viser.scene
+        self._scene.set_up_direction("-y")
+        self._cloud: Any = None
+        self.title = ""
+        self._shown: ShownMap | None = None
+        self._label = ""
+        self._colour, self._least = "depth", 0.0
+        self._limits: Limits | None = None
+        self._answered: dict[int, object] = {}
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Stop serving."""
+        self.server.close()
+
+    def serve(self) -> None:
+        """Serve until an interrupt, or until `beat` says that it is over."""
+        while self.beat():
+            self._wake.wait(_BEAT_S)
+            self._wake.clear()
+
+    def beat(self) -> bool:
+        """Take wishes and news; False if it is over."""
+        raise NotImplementedError
+
+    def row_counts(self, number: int, row: int) -> RowCounts | None:
+        """Counts of a row of the shown map, if there are any."""
+        raise NotImplementedError
+
+    def tell_map(self) -> None:
+        """Tell the pages the shown map: points, pictures and its description."""
+        shown = self._shown
+        if shown is None:
+            return
+        self._limits = steady_limits(self._limits, shown.depth_m)
+        found = points(shown, self._colour, self._least, self._asked.view_points, self._limits)
+        told: dict[str, Any] = {
+            "number": shown.number,
+            "label": self._label,
+            "colour": self._colour,
+            "least": self._least,
+            "points": 0 if found is None else len(found.xyz_m),
+            "of_points": 0 if found is None else found.of,
+            "limits": None if found is None else found.limits,
+            "doubts": list(shown.about.get("doubts") or ()),
+        }
+        if found is None or not len(found.xyz_m):
+            if self._cloud is not None:
+                self._cloud.remove()
+                self._cloud = None
+        else:
+            spread = float(np.sqrt(found.of / len(found.xyz_m)))
+            self._cloud = self._scene.add_point_cloud(
+                "/map", found.xyz_m, found.rgb, point_size=spread * _pixel_m(shown), precision="float32",
+                point_shape="square", point_shading="flat",
+            )  # fmt: skip
+        self.pages.tell("map", told)
+        for what in _PICTURES:
+            picture = picture_of(shown, what, self._least, self._limits)
+            self.pages.tell(f"picture-{what}", {"there": picture is not None, **_size(shown)}, picture or b"")
+
+    def take_common(self, wish: Wish) -> bool:
+        """Fulfil a wish that both kinds of pages have; False for another one."""
+        if wish.ask == "colour" and wish.values["by"] in COLOURS:
+            self._colour = wish.values["by"]
+        elif wish.ask == "confidence":
+            self._least = min(max(wish.values["least"], 0.0), 1.0)
+        else:
+            return False
+        self.tell_map()
+        return True
+
+    def answer_rows(self, following: Sequence[Wish], news: object = None) -> None:
+        """Tell each page about the pixel under its cursor, if that or the map has changed. news: another object
+        whenever the counts may have."""
+        self._answered = {wish.page: self._answered.get(wish.page) for wish in following}
+        for wish in following:
+            state = wish, self._shown, news
+            before = self._answered[wish.page]
+            if isinstance(before, tuple) and all(a is b for a, b in zip(before, state, strict=True)):
+                continue
+            self._answered[wish.page] = state
+            self.pages.answer(wish.page, "row", self._row_answer(wish.values["row"], wish.values["x"]))
+
+    def look_from_camera(self, distance_m: float) -> None:
+        """Begin new pages with the view of the camera, turning about a point at this distance."""
+        camera = self.server.viser.initial_camera
+        camera.position, camera.look_at = (0.0, 0.0, -0.15 * distance_m), (0.0, 0.0, distance_m)
+        camera.up = (0.0, -1.0, 0.0)
+
+    def _row_answer(self, row: int, x: int) -> dict[str, Any]:
+        shown = self._shown
+        if shown is None:
+            return {"row": row, "x": x}
+        column = shown.column_at(row, x)
+        answer: dict[str, Any] = {"map": shown.number, "row": row, "x": x, "column": column, **shown.pixel(row, x)}
+        counted = self.row_counts(shown.number, row)
+        if column is None and counted is not None and len(counted.counts) == 1:
+            column = 0  # of imported frames
+        if column is not None and shown.stripe:
+            answer["stripe"] = shown.stripe_at(row, column)
+        if counted is not None and column is not None:
+            answer |= {
+                "profile": counted.counts[column],
+                "exposures": int(counted.frames[column]),
+                "window_px": [int(counted.begin_px[column]), int(counted.end_px[column])],
+            }
+            if answer["counts"] is None and 0 <= x < counted.counts.shape[1]:
+                answer["counts"] = int(counted.counts[:, x].sum())
+        return answer
+
+    def _download(self) -> tuple[str, bytes] | None:
+        """The shown points as a PLY file; called on another thread."""
+        shown, least = self._shown, self._least
+        ply = None if shown is None else ply_of(shown, least)
+        name = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "-" for c in self.title) or "map"
+        return None if shown is None or ply is None else (f"{name}-{shown.number:06d}.ply", ply)
+
+
+class _ShowsLive(_Shows):
+    """The page of a running scan."""
+
+    def __init__(self, request: ViewRequest, source: LiveSource) -> None:
+        super().__init__(request)
+        with suppress(AttributeError, OSError):  # there is none on Windows
+            os.nice(_NICE)
+        self._source = source
+        self._fog: list[dict[str, Any]] = []
+        self._figures: list[health.Figure] = []
+        self._state: LiveState | None = None
+        self._told_s = -np.inf
+        self._parent = os.getppid() if hasattr(os, "getppid") else 0
+        self._tell_setup({}, "waiting for a scan")
+        self.look_from_camera(5.0)
+
+    def beat(self) -> bool:
+        """Take wishes and news; False if it is over, because the scan has ended and nobody looks."""
+        wishes, following = self.pages.wishes()
+        for wish in wishes:
+            if not self.take_common(wish) and wish.ask == "stop" and self._source.stop():
+                self.pages.tell("notice", {"text": "The scan was asked to stop, as by Ctrl-C."})
+        if following:
+            self._source.follow(following[-1].values["row"])
+        due = time.monotonic() - self._told_s >= 1.0 / self._asked.view_rate
+        slot = self._source.slot
+        news = self._source.poll(maps=due)
+        self._take(news, begun=self._source.slot is not slot)
+        self.answer_rows(following, self._source.newest_row)
+        over = self._source.state in (LiveState.ENDED, LiveState.LOST) or os.getppid() != self._parent
+        return not (self._asked.until_closed and over and not self.pages.open)
+
+    def row_counts(self, number: int, row: int) -> RowCounts | None:
+        """Counts of a row of the newest map, if the scan has sent them."""
+        return self._source.row(number, row)
+
+    def _take(self, news: LiveNews, begun: bool) -> None:
+        if begun and self._source.slot is not None:
+            self._fog.clear()
+            self._shown, self._limits = None, None
+            self.pages.forget("notice")
+            self._tell_setup({}, self._source.slot.name)
+        if news.setup is not None:
+            near_m, far_m = news.setup.get("depth_range_m") or (1.0, 9.0)
+            self.look_from_camera(0.5 * (near_m + far_m))
+            self._tell_setup(news.setup, str(news.setup.get("name") or ""))
+        if news.status is not None:
+            self._figures = health.of_status(news.status)
+        if news.figures is not None:
+            self._figures = [*health.of_alignment(news.figures), *self._figures]
+        if news.status is not None or news.figures is not None:
+            self.pages.tell("health", {"figures": self._figures})
+        if news.profile is not None:
+            self.pages.tell("profile", {"profile": np.nan_to_num(news.profile)})
+        if news.map is not None:
+            self._shown, self._label = news.map, f"map {news.map.number}"
+            self._told_s = time.monotonic()
+            self.tell_map()
+            self._tell_fog(news.map)
+        elif news.frames is not None and (self._shown is None or not self._shown.stripe):
+            self._shown, self._label = news.frames, "the newest frames, no map yet"
+            self._told_s = time.monotonic()
+            self.tell_map()
+        if self._source.state is not self._state:
+            self._state = self._source.state
+            self.pages.tell("state", {"state": self._state.value, "text": _STATES[self._state]})
+
+    def _tell_fog(self, shown: ShownMap) -> None:
+        reading = health.fog_of(shown.about.get("fog"))
+        self._fog.append({"map": shown.number, **(reading or {})})
+        del self._fog[:-_FOG_KEPT]
+        self.pages.tell("fog", {"readings": self._fog})
+
+    def _tell_setup(self, setup: Mapping[str, Any], title: str) -> None:
+        self.title = title
+        uncalibrated = ((setup.get("config") or {}).get("calibration", "") is None) if setup else False
+        notes = ["No depth: the rig is not calibrated (rig calibrate)."] if uncalibrated else []
+        streams = setup.get("estimator") == "likelihood"
+        notes += ["While maps stream, likelihood keeps no counts of rows after the first map."] if streams else []
+        told = {
+            "live": True,
+            "kind": setup.get("kind") or "live",
+            "title": title,
+            "numbers": [],
+            "estimators": [],
+            "notes": notes,
+            "folder": setup.get("folder"),
+            "exposures": setup.get("exposures"),
+        }
+        self.pages.tell("setup", told)
+
+
+class _ShowsRun(_Shows):
+    """The page of a finished run."""
+
+    def __init__(self, request: ViewRequest, source: RunSource) -> None:
+        super().__init__(request)
+        self._source = source
+        self._again: Estimation | None = None
+        self.title = source.folder.absolute().name
+        told = {
+            "live": False,
+            "kind": "run",
+            "title": self.title,
+            "numbers": source.numbers,
+            "estimators": list(estimator_names()) if source.recorded else [],
+            "notes": source.notes,
+            "folder": str(source.folder),
+            "exposures": source.summary.get("exposures"),
+        }
+        self.pages.tell("setup", told)
+        self.pages.tell("state", {"state": "run", "text": ""})
+        self.pages.tell("health", {"figures": health.of_summary(source.summary, source.manifest)})
+        self._tell_fog(source.summary.get("fog"), source.numbers[-1])
+        self._select(source.numbers[-1])
+
+    def __exit__(self, *error: object) -> None:
+        """Stop serving, and an estimate under way."""
+        if self._again is not None:
+            self._again.close()
+        super().__exit__(*error)
+
+    def beat(self) -> bool:
+        """Take wishes, and the result of an estimate."""
+        wishes, following = self.pages.wishes()
+        for wish in wishes:
+            if self.take_common(wish):
+                continue
+            if wish.ask == "map" and wish.values["index"] in self._source.numbers:
+                self._select(wish.values["index"])
+            elif wish.ask == "recorded" and self._shown is not None:
+                self._select(self._shown.number)
+            elif wish.ask == "estimate" and self._source.recorded and wish.values["estimator"] in estimator_names():
+                self._begin(wish.values["estimator"])
+        if self._again is not None and (made := self._again.poll()) is not None:
+            self._take(made)
+        self.answer_rows(following)
+        return True
+
+    def row_counts(self, number: int, row: int) -> RowCounts | None:
+        """Counts of a row, from the recording."""
+        return self._source.row(number, row)
+
+    def _select(self, number: int) -> None:
+        try:
+            self._shown = self._source.map(number)
+        except (RigError, DeviceError) as error:
+            self.pages.tell("notice", {"text": f"Map {number} cannot be shown: {error}"})
+            return
+        self.pages.forget("notice")
+        self._label = f"map {number}" if self._shown.stripe else f"counts of map {number}, which has no estimate"
+        if not self._source.recorded and not self._shown.stripe:
+            self._label = f"sum {number} of imported frames"
+        if self._limits is None and self._shown.depth_m is not None and np.isfinite(self._shown.depth_m).any():
+            self.look_from_camera(float(np.nanmedian(self._shown.depth_m)))
+        self.tell_map()
+
+    def _begin(self, estimator: str) -> None:
+        if self._again is not None or self._shown is None or self._source.rows is None:
+            self.pages.tell("notice", {"text": "An estimate is under way; wait for it."})
+            return
+        least = self._least or self._source.min_confidence
+        cut = self._source.rows.plan.blanking is None
+        asked = EstimationRequest(self._source.folder, self._shown.number, estimator, least, cut)
+        try:
+            self._again = Estimation(asked)
+        except UsageError as error:
+            self.pages.tell("notice", {"text": str(error)})
+            return
+        self.pages.tell("estimate", {"busy": True, "text": f"estimating map {asked.number} with {estimator}"})
+
+    def _take(self, made: Estimated) -> None:
+        assert self._again is not None, "it was polled"
+        asked = made.request
+        try:
+            if made.folder is None:
+                text = f"Map {asked.number} could not be estimated with {asked.estimator}: {made.problem}"
+                self.pages.tell("notice", {"text": text})
+            else:
+                rows = self._source.rows
+                rays = None if rows is None or rows.model is None else rows.geometry.rays
+                found = read_map(made.folder, made.number, rays, {"min_confidence": asked.min_confidence})
+                self._shown = replace(found, number=asked.number)
+                took_s = float(made.summary.get("compute_time_s") or 0.0)
+                self._label = f"map {asked.number}, estimated again with {asked.estimator} in {took_s:.2g} s"
+                self.tell_map()
+                self._tell_fog(made.summary.get("fog"), asked.number)
+        except RigError as error:
+            self.pages.tell("notice", {"text": str(error)})
+        finally:
+            self._again.close()
+            self._again = None
+            self.pages.tell("estimate", {"busy": False, "text": ""})
+
+    def _tell_fog(self, fog: Mapping[str, Any] | None, number: int) -> None:
+        reading = health.fog_of(fog)
+        self.pages.tell("fog", {"readings": [{"map": number, **reading}] if reading else []})
+
+
+def _pixel_m(shown: ShownMap) -> float:
+    """Distance between the points of neighbouring pixels at the map's usual depth, in metres."""
+    assert shown.depth_m is not None, "it has points"
+    assert shown.rays is not None, "it has points"
+    step = float(np.nanmedian(np.abs(np.diff(shown.rays[0], axis=1))))
+    return 1.2 * float(np.nanmedian(shown.depth_m)) * (step if np.isfinite(step) else 2e-3)
+
+
+def _size(shown: ShownMap) -> dict[str, int]:
+    for array in (shown.depth_m, shown.counts):
+        if array is not None:
+            return {"rows": array.shape[0], "width": array.shape[1]}
+    rows = len(shown.stripe["x_px"]) if shown.stripe else 0
+    return {"rows": rows, "width": 0}
