@@ -1,6 +1,6 @@
 """Kinds of devices and worlds by name, found through entry points, so that any installed package can add one."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, TypeVar
@@ -65,6 +65,7 @@ class Kind:
 
 
 Config = TypeVar("Config", bound=BaseModel)
+Loaded = TypeVar("Loaded")
 
 
 def config_of(kind: type[Config], **fields: object) -> Config:
@@ -112,9 +113,16 @@ def kinds(slot: str) -> tuple[str, ...]:
 def lookup(slot: str, kind: str) -> Kind:
     """Load the kind of a slot. Raises `UnknownKind`, with the choices or with the reason why the entry cannot be used,
     and ValueError for an unknown slot."""
-    found = {entry.value: entry for entry in _entries(slot) if entry.name == kind}
+    return load_entry(slot, kind, _entries(slot), Kind)
+
+
+def load_entry(slot: str, kind: str, entries: Iterable[EntryPoint], wanted: type[Loaded]) -> Loaded:
+    """Load the one entry point of this name among those of a slot, which must be a `wanted`. Raises `UnknownKind`, with
+    the choices or with the reason why the entry cannot be used."""
+    entries = tuple(entries)
+    found = {entry.value: entry for entry in entries if entry.name == kind}
     if not found:
-        choices = ", ".join(kinds(slot)) or "none installed"
+        choices = ", ".join(sorted({entry.name for entry in entries})) or "none installed"
         raise UnknownKind(
             f"{slot}: unknown kind {kind!r}; choose one of: {choices}, or install the package that has it"
         )
@@ -125,8 +133,9 @@ def lookup(slot: str, kind: str) -> Kind:
         loaded = entry.load()
     except (ImportError, AttributeError, TypeError) as error:
         raise UnknownKind(f"{slot}: kind {kind!r} cannot be loaded from {entry.value}: {error}") from error
-    if not isinstance(loaded, Kind):
-        raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no drivers.registry.Kind")
+    if not isinstance(loaded, wanted):
+        what = f"{wanted.__module__}.{wanted.__name__}"
+        raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no {what}")
     return loaded
 
 

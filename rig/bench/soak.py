@@ -26,13 +26,13 @@ from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, S
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, walk_blocks
 from rig.bench.machine import machine
+from rig.config.estimators import AUTO, estimator_names, is_estimator
 from rig.config.files import load_config
 from rig.config.models import MOST_THREADS, EstimateConfig
 from rig.depth.warm_up import warm_up
 from rig.devices.open import OpenRig, open_rig
 from rig.devices.prepare import prepare
 from rig.errors import UsageError
-from rig.estimate.registry import ESTIMATORS
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.writer import Recording
@@ -274,8 +274,9 @@ def soak(request: SoakRequest | None = None, *, progress: Progress | None = None
         monitor=MonitorView.row_profile,  # what a viewer would show
         sweeps=(lambda _: time.sleep(slow_s)) if slow_s else None,
     )
-    if request.estimator not in ESTIMATORS:
-        raise UsageError(f"estimator {request.estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if request.estimator == AUTO or not is_estimator(request.estimator):
+        known = ", ".join(estimator_names())
+        raise UsageError(f"estimator {request.estimator!r} is unknown; choose one of {known}")
     if request.threads is not None and not 1 <= request.threads <= MOST_THREADS:
         raise UsageError(f"{request.threads} threads were asked for; give 1 to {MOST_THREADS}")
     with _looped_rig(policy, request) as (rig, spad), _quiet_sweeps():

@@ -16,9 +16,13 @@ def names(kind: Kind) -> Iterable[str]:
         from rig.config.bundled import bundled_rigs, bundled_scenes
 
         return (one.name for one in (bundled_rigs if kind == "config" else bundled_scenes)())
-    from rig.estimate.registry import ESTIMATORS, FILTERS
+    if kind == "filter":
+        from rig.estimate.registry import FILTERS
 
-    return ("auto", *ESTIMATORS) if kind == "estimator" else FILTERS
+        return FILTERS
+    from rig.config.estimators import AUTO, estimator_names
+
+    return (AUTO, *estimator_names())
 
 
 def one_of(kind: Kind) -> Callable[[str], list[str]]:

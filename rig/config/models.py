@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -26,10 +26,13 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from drivers.errors import UnknownKind
 from drivers.registry import KindConfig, kinds, lookup
 from drivers.units import Age, ExactHertz, Metres, Seconds, Watts
+from rig.config.estimators import AUTO as AUTO
+from rig.config.estimators import estimator_names, is_estimator
 
 MOST_LINES = 16
 MOST_THREADS = 256
@@ -63,9 +66,22 @@ LineOffsets = Annotated[
 MIN_DARK_FRACTION = 0.05
 """Smallest share of a sweep's frames that must be dark: the dark rate is learned from them. A `CubePlan` has none."""
 
-AUTO: Final = "auto"
-"""Setting that chooses the estimator: `joint` where it keeps up with the frames, else `likelihood`."""
-Estimator = Literal["auto", "argmax", "edge", "likelihood", "joint"]
+
+def _installed_estimator(name: str) -> str:
+    if not is_estimator(name):
+        *others, last = (repr(each) for each in (AUTO, *estimator_names()))
+        expected = f"{', '.join(others)} or {last}"
+        # The type of error of a field with fixed choices, so that the message is the same.
+        raise PydanticCustomError("literal_error", "Input should be {expected}", {"expected": expected})
+    return name
+
+
+def _list_estimators(schema: dict[str, Any]) -> None:
+    schema["enum"] = [AUTO, *estimator_names()]
+
+
+Estimator = Annotated[str, AfterValidator(_installed_estimator)]
+"""Name of an estimator, of this program or another installed package, or `auto`."""
 Filter = Literal["none", "median"]
 
 
@@ -173,6 +189,7 @@ class EstimateConfig(ConfigSection):
         default=AUTO,
         description="how the stripe is found on each row; auto is joint where that is fast enough, else likelihood",
         examples=["joint"],
+        json_schema_extra=_list_estimators,
     )
     filter: Filter = Field(
         default="none",

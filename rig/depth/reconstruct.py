@@ -18,7 +18,7 @@ from rig.depth.depth import DepthMap, depth_map, share_claims
 from rig.depth.floating import floating_points
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
-from rig.estimate.registry import COUPLED, LEARNING, Learned, ManyMaps, create_estimator, recalling
+from rig.estimate.registry import LEARNING, Learned, ManyMaps, create_estimator, is_coupled, recalling
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
@@ -119,7 +119,7 @@ class Reconstructor:
         self._min_confidence = estimate.min_confidence
         self._keep_floating = estimate.keep_floating
         self._filter = estimate.filter
-        self._coupled = estimate.estimator in COUPLED
+        self._coupled = is_coupled(estimate.estimator)
         self._lines = lines
         threads = estimate.threads or os.cpu_count() or 1
         self._workers = RowWorkers(threads)

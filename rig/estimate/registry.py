@@ -1,11 +1,21 @@
 """Stripe estimators by name. An estimator turns the counts of a sweep into a stripe table.
 
+Those of other packages are entry points of the group `spadrig.estimator`, each of which loads an `EstimatorKind`.
+
 `create_estimator` makes one that has learned nothing yet. `recalling` makes one that estimates earlier maps again, bit
 for bit, from the learned state that was kept with each of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from drivers.errors import UnknownKind
+from drivers.registry import load_entry
+from rig.config.estimators import ESTIMATORS as ESTIMATORS
+from rig.config.estimators import SLOT
+from rig.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,12 +25,11 @@ if TYPE_CHECKING:
     from rig.geometry.stripe_table import StripeTable
     from rig.geometry.windows import SweepGeometry
 
-ESTIMATORS = ("argmax", "edge", "likelihood", "joint")
 FILTERS = ("none", "median")
 LEARNING = frozenset({"likelihood", "joint"})
 """Estimators that learn from the stream. Their first map takes much longer than later ones."""
 COUPLED = frozenset({"joint"})
-"""Estimators in which neighbours influence each other's answers: that neighbours agree is then no further evidence."""
+"""Estimators of this program in which neighbours influence each other's answers. See `is_coupled`."""
 
 
 class Learned(Protocol):
@@ -57,6 +66,18 @@ class Estimator(Protocol):
     def estimate(self, sweep: Any, geometry: "SweepGeometry") -> "StripeTable":
         """Stripe table of one sweep. sweep: the result of a counter of this estimator, or a `CountVolume`."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorKind:
+    """The object that the entry point of an estimator of another package loads.
+
+    create: makes a fresh estimator that uses up to so many threads. Its answers must not depend on that number.
+    coupled: whether neighbouring rows or columns influence each other's answers.
+    """
+
+    create: Callable[[int], Estimator]
+    coupled: bool = False
 
 
 class Work(Protocol):
@@ -114,16 +135,32 @@ def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, tempor
 def create_estimator(
     name: str, threads: int = 2, *, temporal_prior: bool = False, kept: Learned | None = None
 ) -> Estimator:
-    """A fresh estimator that uses up to `threads` threads. name: one of ESTIMATORS, else KeyError.
+    """A fresh estimator that uses up to `threads` threads. name: one of ESTIMATORS, or an estimator of another package;
+    raises UsageError if there is none of this name, or it cannot be loaded.
 
     temporal_prior: whether `joint` uses the last map as a weak prior. kept: the state of an earlier run, with which
     `joint` begins if it explains the first map. The other estimators ignore both.
     """
     if name in LEARNING:
         return _learning(name, threads, learns=True, temporal_prior=temporal_prior, kept=kept)
+    if name not in ESTIMATORS:
+        return _kind(name).create(threads)
     from rig.estimate.argmax_edge import Peaks
 
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
+
+
+def is_coupled(name: str) -> bool:
+    """Whether neighbours influence each other's answers: that they agree is then no further evidence. Raises UsageError
+    as `create_estimator` does."""
+    return name in COUPLED if name in ESTIMATORS else _kind(name).coupled
+
+
+def _kind(name: str) -> EstimatorKind:
+    try:
+        return load_entry(SLOT, name, entry_points(group=f"spadrig.{SLOT}"), EstimatorKind)
+    except UnknownKind as error:
+        raise UsageError(str(error)) from error
 
 
 def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool, kept: Any = None) -> LearnsFromStream:

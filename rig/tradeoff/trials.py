@@ -6,10 +6,11 @@ from itertools import count, product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from rig.config.estimators import estimator_names
 from rig.config.models import AUTO, RigConfig
 from rig.config.overrides import Config, configure, with_lines
 from rig.errors import each_or_problems
-from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.estimate.registry import FILTERS
 from rig.progress import Progress, part, tell_stage
 from rig.requests import TradeoffRequest
 from rig.tradeoff.choice import Choice, Wish, advice, choose
@@ -122,7 +123,7 @@ def method_problems(estimators: Sequence[str], filters: Sequence[str]) -> list[s
     return [
         f"{what} {name!r} {'is a choice between others' if (what, name) == ('estimator', AUTO) else 'is unknown'}; "
         f"choose of {', '.join(known)}"
-        for what, names, known in (("estimator", estimators, ESTIMATORS), ("filter", filters, FILTERS))
+        for what, names, known in (("estimator", estimators, estimator_names()), ("filter", filters, FILTERS))
         for name in names
         if name not in known
     ]
