@@ -54,6 +54,8 @@ class BlockRing:
         """Largest number of slots that held published and not yet released blocks at one time."""
         self.waited_s = 0.0
         """Time the source spent in `claim` because no slot was free."""
+        self.newest: tuple[int, int, int] | None = None
+        """Run id, number and start tick of the last frame published; None before the first."""
         self.last_frame = -1
         """Number of the last frame published (-1 before the first), plus the number of frames dropped since."""
         self.dropped_blocks = 0
@@ -130,7 +132,10 @@ class BlockRing:
         with self._changed:
             self._require_unfinished("publish")
             slot = self._oldest_claimed("publish")
-            self.last_frame = block.header.first_frame + block.n_frames - 1
+            header = block.header
+            self.last_frame = header.first_frame + block.n_frames - 1
+            if block.n_frames:
+                self.newest = header.run_id, self.last_frame, header.t0_ticks + int(block.records["ticks"][-1])
             for reader in self._readers:
                 if reader._offer(slot, block):
                     self._holders[slot] += 1

@@ -20,7 +20,7 @@ from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest
 
 if TYPE_CHECKING:
     from drivers.replay.pace import Pace
-    from rig.recording.open import RecordingInfo
+    from rig.recording.open import RecordingInfo, RunInfo
     from rig.recording.verify import Verification
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="folder of a recorded run", show_default=False)]
@@ -111,13 +111,21 @@ def _show_info(found: "RecordingInfo") -> None:
         maps = "no whole map" if run.first_map is None else f"maps {run.first_map} to {(run.end_map or 0) - 1}"
         gaps = f", {run.gaps} gaps of {run.lost} frames" if run.gaps else ""
         print(
-            f"start {number}: frames {run.first_frame} to {run.end_frame - 1}{gaps}, {run.width} x {run.height} of "
-            f"{run.sensor_width} x {run.sensor_height}, {rate}, {run.duration_s:.6g} s, {maps}"
+            f"start {number}: {_taken(run)}frames {run.first_frame} to {run.end_frame - 1}{gaps}, "
+            f"{run.width} x {run.height} of {run.sensor_width} x {run.sensor_height}, {rate}, {run.duration_s:.6g} s, {maps}"
         )
     for slot, name in found.devices.items():
         print(f"{slot}: {name}")
     for line in found.problems:
         say(line)
+
+
+def _taken(run: "RunInfo") -> str:
+    """When a start was taken, in words; empty if the recording does not say."""
+    if run.first_frame_utc is None:
+        return ""
+    sure = "simulated time" if run.utc_uncertainty_s is None else f"+- {run.utc_uncertainty_s * 1e3:.3g} ms"
+    return f"{run.first_frame_utc} ({sure}), "
 
 
 def _megabytes(size: int) -> str:

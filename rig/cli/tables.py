@@ -18,6 +18,7 @@ from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
 from rig.cli.command import in_options
 from rig.run_folder.runs import DAMAGED, RunEntry
 from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
+from rig.run_folder.time_of_day import RunTime
 from rig.scan.run import RunResult
 from rig.tradeoff.effects import Effect, Flux, SceneEffects
 from rig.tradeoff.rows import TradeoffRow
@@ -155,6 +156,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         *((("note", _one_line(summary.note)),) if summary.note else ()),
         *((("tags", ", ".join(summary.tags)),) if summary.tags else ()),
         ("maps", f"{summary.maps} of {summary.columns} columns x {summary.exposures} exposures, {estimator}"),
+        *((("taken", _taken(summary.time)),) if summary.time is not None else ()),
         *((("learned", summary.learned),) if summary.learned else ()),
         ("frames", f"{frames.received} received, {frames.lost} lost, {frames.lit} on columns"),
         (
@@ -186,6 +188,14 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
             ("depth error", f"mean {_number(depth['mean_abs'])} m, median {_number(depth['median_abs'])} m"),
         ]
     return rows
+
+
+def _taken(time: RunTime) -> str:
+    """First and last frame of the maps in UTC, and how sure that is."""
+    first, last = time.first_frame_utc, time.last_frame_utc
+    sure = "" if time.uncertainty_s is None else f" +- {digits(time.uncertainty_s * 1e3)} ms"
+    scale = {"host": "", "virtual": ", in simulated time", "recorded": ", when it was recorded"}[time.scale]
+    return f"{first} to {last[11:]}{sure}{scale}"
 
 
 def _sync(sync: Synchronisation) -> str:

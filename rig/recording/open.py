@@ -20,6 +20,7 @@ from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
+from rig.run_folder.time_of_day import Anchor, read_anchors, utc_text
 
 SEGMENTS: Final = "frames-*.spb"
 """Pattern of the names of files that hold a recording's frames."""
@@ -164,6 +165,8 @@ class RunInfo:
     frames: number recorded. gaps: number of stretches missing between these and, if a repair found some, at the ends.
     lost: number of frames in the gaps. width, height: pixels of a frame. frame_rate_hz: None if triggered from outside.
     duration_s: from the first frame to the end of the last one or, without a rate, to the start of the last block.
+    first_frame_utc, utc_uncertainty_s: when the first frame was taken; None if the recording does not say (no
+    uncertainty: in a simulated rig's own time).
     """
 
     run_id: int
@@ -180,6 +183,8 @@ class RunInfo:
     duration_s: float
     first_map: int | None
     end_map: int | None
+    first_frame_utc: str | None = None
+    utc_uncertainty_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +223,7 @@ def info(run: PathLike) -> RecordingInfo:
     spans = map_spans(recording, manifest)
     files = list(segment_files(folder).values())
     content = manifest or {}
-    known = known_missing(manifest) or []
+    known, anchors = known_missing(manifest) or [], read_anchors(content)
     return RecordingInfo(
         folder=folder,
         verdict=content.get("verdict"),
@@ -228,7 +233,7 @@ def info(run: PathLike) -> RecordingInfo:
         blocks=sum(len(run.entries) for run in recording.runs),
         frames=recording.frames,
         maps=sum(_is_there(span, recording.runs[span.run], content) for span in spans),
-        runs=[_run_info(run, spans, known) for run in recording.runs],
+        runs=[_run_info(run, spans, known, anchors.get(run.header.run_id)) for run in recording.runs],
         config=(content.get("config") or {}).get("name"),
         devices={slot: str(of.get("name")) for slot, of in (content.get("devices") or {}).items()},
         versions=content.get("versions") or {},
@@ -244,12 +249,13 @@ def _is_there(span: MapSpan, run: RecordedRun, manifest: dict[str, Any]) -> bool
     return begin >= run.first_frame and span.end_frame < run.end_frame
 
 
-def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap]) -> RunInfo:
+def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap], anchor: Anchor | None) -> RunInfo:
     header, entries = run.header, run.entries
     maps = [i for i, span in enumerate(spans) if span.run == run.number]
     of_run = {(first, last) for number, first, last in known if number == run.number}
     gaps = [*run.gaps(), *(gap for gap in of_run if gap[1] < run.first_frame or gap[0] >= run.end_frame)]
     period = header.frame_period_ticks
+    taken = None if anchor is None else anchor.of(run.first_frame)
     last_tick = int(entries["t0_ticks"][-1]) + int(entries["n_frames"][-1]) * period
     return RunInfo(
         run_id=header.run_id,
@@ -266,6 +272,8 @@ def _run_info(run: RecordedRun, spans: Sequence[MapSpan], known: Sequence[RunGap
         duration_s=float((last_tick - int(entries["t0_ticks"][0])) / header.tick_hz),
         first_map=maps[0] if maps else None,
         end_map=maps[-1] + 1 if maps else None,
+        first_frame_utc=None if taken is None else utc_text(taken.utc_ns),
+        utc_uncertainty_s=None if taken is None else taken.uncertainty_s,
     )
 
 

@@ -44,6 +44,7 @@ from rig.run_folder.manifest import (
     read_manifest,
     require_playable,
 )
+from rig.run_folder.time_of_day import RecordedTimes
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -183,6 +184,11 @@ class ReplayFacts:
     def count_starts(self) -> int:
         """Largest number of starts needed for the maps."""
         return -(-self.maps // self._there) * len(self._played)
+
+    def times(self, timing: SpadTiming) -> RecordedTimes | None:
+        """The times of day at which the frames were exposed; None if the recording has none."""
+        noted = read_manifest(self._spad.recording.path) or {}
+        return RecordedTimes(noted, self._numbers) if isinstance(noted.get("time"), dict) else None
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
         """Truth that was recorded with the map of a sweep; None if it was not kept.

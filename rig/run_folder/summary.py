@@ -13,6 +13,7 @@ from drivers.replay.pace import PaceReport
 from rig.depth.fog_meter import FogEstimate
 from rig.depth.reconstruct import MapResult
 from rig.geometry.stripe_table import depth_errors, stripe_errors
+from rig.run_folder.time_of_day import RunTime
 
 _LARGEST = {
     "ring_slots", "ring_bytes", "ring_high_water", "map_queue", "map_queue_high_water", "recorder_s", "recorder_blocks",
@@ -138,6 +139,7 @@ class Summary:
     against the calibration that the user accepted. estimator_why: why the run chose this estimator; empty if it was
     named. learned: if a file for learned states was named, whether the first map was estimated with the state in it,
     and why if not; else empty. note, tags: given with the run, for people.
+    time: when the maps were taken, where that is known.
     """
 
     maps: int
@@ -164,6 +166,7 @@ class Summary:
     learned: str = ""
     note: str = ""
     tags: tuple[str, ...] = ()
+    time: RunTime | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The summary as plain values. `truth` and the fields after `verdict` are left out if empty or None."""
@@ -171,7 +174,7 @@ class Summary:
         content["verdict"] = self.verdict.value
         optional = (
             "truth", "stages", "sync", "replay", "verdict_reasons", "accepted_calibration", "estimator_why", "learned",
-            "note", "tags",
+            "note", "tags", "time",
         )  # fmt: skip
         return {name: value for name, value in content.items() if value or name not in optional}
 
@@ -232,6 +235,7 @@ class MapTally:
         sync: Synchronisation | None = None,
         replay: PaceReport | None = None,
         accepted_calibration: tuple[str, ...] = (),
+        time: RunTime | None = None,
     ) -> Summary:
         """Make the summary of the run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
@@ -263,6 +267,7 @@ class MapTally:
             learned=self.learned,
             note=self.note,
             tags=self.tags,
+            time=time,
         )
 
 

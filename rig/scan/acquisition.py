@@ -30,6 +30,7 @@ from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import RecordedStart
 from rig.recording.writer import Recording
 from rig.run_folder.summary import PipelineStats
+from rig.run_folder.time_of_day import TimeOfDay
 from rig.scan.counting import AcquiredMap, CountingRequest
 from rig.scan.monitor import NOBODY, Listeners, ScanProgress
 from rig.scan.pipeline import JOIN_S, Overload, Pipeline, require_policy, ring_for
@@ -56,6 +57,7 @@ class AcquisitionRequest:
     starts: for a replay, the recorded starts with the number of sweeps of each; None lets the scan choose.
     silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
     recording: takes every block; None records nothing.
+    times: notes the time of day of frames; None for a replay.
     listeners: callbacks that are informed of the progress.
     """
 
@@ -66,6 +68,7 @@ class AcquisitionRequest:
     starts: Iterator[RecordedStart] | None = None
     silence_s: float = SILENCE_S
     recording: Recording | None = None
+    times: TimeOfDay | None = None
     listeners: Listeners = NOBODY
 
 
@@ -163,7 +166,8 @@ class Acquisition:
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
         on_frame = None if rig.guard is None else rig.guard.beat
         told = self._listeners
-        pipeline = Pipeline(rig.spad, ring, work, asked.recording, told.monitor, on_frame, told.watched)
+        times = None if asked.times is None else asked.times.begin(done)
+        pipeline = Pipeline(rig.spad, ring, work, asked.recording, told.monitor, on_frame, told.watched, times)
         if rig.guard is not None:
             rig.guard.expect(self._guard_limits(sweeps))
             rig.spad.on_wait = rig.guard.wait
@@ -174,6 +178,8 @@ class Acquisition:
         try:
             try:
                 self._arm_laser()
+                if times is not None:
+                    times.ask()
                 rig.spad.start(self._burst_frames(sweeps))
                 self._pipeline = pipeline
                 rig.sync.run()

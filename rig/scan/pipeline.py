@@ -18,6 +18,7 @@ from rig.errors import RecordingError, UsageError
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.writer import WRITERS, Recorder, Recording
 from rig.run_folder.summary import PipelineStats
+from rig.run_folder.time_of_day import StartTimes
 from rig.scan.counting import CountingRequest, CountingThread, MapQueue
 from rig.scan.monitor import Monitor, MonitorCallback
 from rig.scan.source import Source
@@ -37,7 +38,7 @@ MONITOR_S = 0.5
 class Pipeline:
     """The threads of one start of the SPAD, see the module. maps: the queue of maps to the caller.
 
-    recording: takes every block; None for no recorder. on_frame: as in `Source`. watched: as in `Monitor`.
+    recording: takes every block; None for no recorder. on_frame, times: as in `Source`. watched: as in `Monitor`.
     """
 
     def __init__(
@@ -49,10 +50,11 @@ class Pipeline:
         monitor: MonitorCallback | None = None,
         on_frame: Callable[[int], None] | None = None,
         watched: Callable[[], bool] | None = None,
+        times: StartTimes | None = None,
     ) -> None:
         self._ring = ring
         self.maps = MapQueue(MAPS_AHEAD)
-        self._source = Source(spad, ring, work.silence_s, self.maps.end_stream, on_frame)
+        self._source = Source(spad, ring, work.silence_s, self.maps.end_stream, on_frame, times)
         reader = ring.reader("counting", holds=max(1, min(MOST_UNDER_WAY, ring.slots // 4)))
         self._counting = CountingThread(reader, work, self.maps, self._source, self._complete)
         self._recording = recording

@@ -95,14 +95,14 @@ class Run:
 
     def start_recording(
         self,
-        manifest: Mapping[str, Any],
+        manifest: Callable[[], Mapping[str, Any]],
         write_inputs: Callable[[Path], None],
         space: Space,
     ) -> Recording:
         """Begin the recording of a run in its folder; it is closed with the run.
 
-        manifest: what is known before the first frame; it is on the disk before this returns, and written again with
-          each start of the SPAD.
+        manifest: gives what is known so far; it is on the disk before this returns, and written again with each start
+          of the SPAD.
         write_inputs: writes the files that have to lie beside the frames.
         space: the most room that frames and maps will take.
         Raises UsageError if the disk has less room or files beside the frames cannot be written, RecordingError if the
@@ -114,7 +114,7 @@ class Run:
 
         def begun() -> None:
             assert self._recording is not None, "tells of its starts only"
-            content = {"versions": versions(), **manifest, "inputs": self._inputs, "verdict": UNFINISHED}
+            content = {"versions": versions(), **manifest(), "inputs": self._inputs, "verdict": UNFINISHED}
             content["recording"] = self._recording.content()
             folder.write_json("manifest.json", content)
 

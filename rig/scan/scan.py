@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock import VirtualClock
 from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
@@ -40,6 +41,7 @@ from rig.recording.replay import RecordedStart, ReplayFacts
 from rig.recording.segment import Space, paged
 from rig.requests import RunRequest, request_content
 from rig.run_folder.folder import SavePolicy, write_learned
+from rig.run_folder.time_of_day import TimeOfDay, run_time
 from rig.scan.acquisition import SILENCE_S, Acquisition, AcquisitionRequest
 from rig.scan.estimator import choose_estimator, foreseen_estimator, kept_model
 from rig.scan.monitor import NOBODY, Listeners, RunBegun
@@ -48,8 +50,9 @@ from rig.scan.run import Run, RunResult, frames_of, frames_that_came, sweep_cont
 
 _log = logging.getLogger(__name__)
 
-BYTES_PER_PIXEL: Final = 40
-"""Bytes that all files of a map take for every pixel of the camera or of the stripe table, whichever is more."""
+BYTES_PER_PIXEL: Final = 72
+"""Bytes that all files of a map take at most for every pixel of the camera or of the stripe table, whichever is more:
+stripe 28, cloud 16, truth 8, learned 5, depth 4, confidence 4, and 7 for three pictures."""
 
 
 def run_scan(
@@ -109,6 +112,11 @@ def run_scan(
         "tags": list(request.tags),
     }
 
+    times = facts.times(timing)
+
+    def time_content() -> dict[str, Any]:
+        return {} if times is None else {"time": times.content()}
+
     def write_beside(folder: Path) -> None:
         write_inputs(folder, plan, rig.model, kept)
 
@@ -116,7 +124,7 @@ def run_scan(
     if request.record:
         assert run.path is not None, "a recording is asked for with a folder"
         space = recording_space(rig, plan, timing, facts, run.path, run.save)
-        recording = run.start_recording(manifest, write_beside, space)
+        recording = run.start_recording(lambda: manifest | time_content(), write_beside, space)
         if listeners.on_space is not None:
             listeners.on_space(space)
     asked = AcquisitionRequest(
@@ -127,6 +135,7 @@ def run_scan(
         starts=facts.starts,
         silence_s=facts.silence_s,
         recording=recording,
+        times=times if isinstance(times, TimeOfDay) else None,
         listeners=listeners,
     )
     acquisition = Acquisition(rig, plan, timing, reconstructor, asked)
@@ -152,6 +161,7 @@ def run_scan(
     counters, stages = acquisition.counters, acquisition.stages
     outside = [] if ended_by is not None else facts.lost_outside(sweeps)
     frames = frames_of(sweeps, counters.crc_errors, outside)
+    of_maps = [] if times is None else times.of_maps([(s.index, s.first_frame, s.end_frame - 1) for s in sweeps])
     summary = run.tally.summary(
         frames=frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         sensor_time_s=frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
@@ -162,9 +172,11 @@ def run_scan(
         sync=synchronisation_of(sweeps),
         replay=facts.report,
         accepted_calibration=accepted_by(calibration),
+        time=None if times is None else run_time(times.scale, of_maps),
     )
     manifest |= {
-        "sweeps": [sweep_content(sweep) for sweep in sweeps],
+        **time_content(),
+        "sweeps": [sweep_content(sweep) | at for sweep, at in zip(sweeps, of_maps or [{}] * len(sweeps), strict=True)],
         "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
         "counters": asdict(counters),
     }
@@ -209,6 +221,10 @@ class LiveFacts:
         """Largest number of starts of the SPAD."""
         most = most_sweeps(self._rig, self._plan) or self.maps
         return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
+
+    def times(self, timing: SpadTiming) -> TimeOfDay:
+        """What will note when frames are exposed."""
+        return TimeOfDay(timing, "virtual" if isinstance(self._rig.clock, VirtualClock) else "host")
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
         """Truth for a sweep bound to `column`; None without a simulated world. The world is asked only after the

@@ -8,6 +8,7 @@ from drivers.errors import DeviceTimeout
 from drivers.frames import FrameBlock
 from drivers.interfaces import SpadArray
 from drivers.ring import BlockRing, RingReader
+from rig.run_folder.time_of_day import StartTimes
 from rig.threads import StageThread
 
 LOOK_S = 0.02
@@ -21,7 +22,10 @@ class Source:
 
     on_end: called on that thread when it ends, for whatever reason.
     on_frame: called on that thread after each `fill` with the number of the last frame published or dropped; if it
-    raises, the source ends. Its errors and the SPAD's are passed to the readers, after the blocks that came before.
+    raises, the source ends.
+    times: notes when frames arrive.
+
+    Its errors and the SPAD's are passed to the readers, after the blocks that came before.
     """
 
     def __init__(
@@ -31,8 +35,10 @@ class Source:
         silence_s: float,
         on_end: Callable[[], None],
         on_frame: Callable[[int], None] | None = None,
+        times: StartTimes | None = None,
     ) -> None:
         self._spad = spad
+        self._times = times
         self._ring = ring
         self._silence_s = silence_s
         self._on_end = on_end
@@ -82,6 +88,8 @@ class Source:
         begun = time.perf_counter()
         try:
             more = self._spad.fill(self._ring, self._silence_s / 2)
+            if self._times is not None and self._ring.newest is not None:
+                self._times.note(*self._ring.newest)
             if self._on_frame is not None:
                 self._on_frame(self._ring.last_frame)
             return more

@@ -13,6 +13,7 @@ from tests.system.small_rig import HEIGHT, WIDTH
 KEYS = {
     "maps", "map_rate_hz", "columns", "exposures", "estimator", "filter", "frames", "sensor_time_s", "compute_time_s",
     "realtime_factor", "valid_fraction", "floating_points", "fog", "truth", "verdict", "stages", "sync",
+    "time",
 }  # fmt: skip
 
 
