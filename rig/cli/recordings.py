@@ -112,7 +112,8 @@ def _show_info(found: "RecordingInfo") -> None:
         gaps = f", {run.gaps} gaps of {run.lost} frames" if run.gaps else ""
         print(
             f"start {number}: {_taken(run)}frames {run.first_frame} to {run.end_frame - 1}{gaps}, "
-            f"{run.width} x {run.height} of {run.sensor_width} x {run.sensor_height}, {rate}, {run.duration_s:.6g} s, {maps}"
+            f"{run.width} x {run.height} of {run.sensor_width} x {run.sensor_height}, {rate}, "
+            f"{run.duration_s:.6g} s, {maps}"
         )
     for slot, name in found.devices.items():
         print(f"{slot}: {name}")
