@@ -8,7 +8,6 @@ logged once and ends the feed, never the run. A stop that a reader asks for goes
 
 import logging
 import math
-import os
 import shutil
 import signal
 import threading
@@ -340,7 +339,11 @@ def interrupt() -> None:
     start those in the background, gets the next signal that it handles."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if callable(signal.getsignal(number)):
-            os.kill(os.getpid(), number)
+            main = threading.main_thread().ident
+            if hasattr(signal, "pthread_kill") and main is not None:
+                signal.pthread_kill(main, number)  # to that thread, so that a wait of its ends now
+            else:
+                signal.raise_signal(number)
             return
     _log.warning("a stop was asked for in the live view, but this program handles neither SIGINT nor SIGTERM")
 

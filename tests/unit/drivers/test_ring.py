@@ -106,6 +106,19 @@ def test_an_optional_reader_holds_one_slot_and_never_the_last_one() -> None:
     assert sequence(monitor.next(0)) == 20
 
 
+def test_an_idle_reader_is_offered_nothing_and_occupies_no_slot() -> None:
+    ring = BlockRing(4, STRIDE)
+    monitor = ring.reader("monitor", required=False)
+    monitor.idle = True
+    for seq in range(5):
+        put(ring, seq)
+    assert (ring.used, monitor.skipped) == (0, 0)
+    monitor.idle = False
+    put(ring, 5)
+    assert ring.used == 1
+    assert sequence(monitor.next(0)) == 5
+
+
 def test_a_reader_that_closes_holds_nobody_up() -> None:
     ring = BlockRing(2, STRIDE)
     with ring.reader("count") as reader:

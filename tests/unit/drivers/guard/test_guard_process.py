@@ -1,6 +1,7 @@
 """The guard's process without a process: what it asks an armed laser and when, and what it does with the answers."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -105,6 +106,8 @@ def test_an_armed_laser_is_asked_for_faults_each_second_and_between_for_a_sign_o
         rig.laser.lane.work()
     assert laser.asked.count("status") == 3
     assert laser.asked.count("alive") == pytest.approx(2.5 * POLL_S / ALIVE_S, rel=0.2)
+    told = [call.args[0] for call in rig.process._channel.send.call_args_list]
+    assert told == 3 * [{"laser_status": asdict(laser.status)}], "so that nobody else has to ask it"
     rig.laser.call("disarm", [])
     rig.process._poll_laser(1000.0)
     assert rig.laser.lane.idle

@@ -173,7 +173,7 @@ def acquisition(rig, plan, maps, maker=None, **options):
     """An acquisition with the fakes, and little patience with silence."""
     period = int(100_000_000 / plan.frame_rate_hz)
     timing = SpadTiming(Fraction(100_000_000), period, period, STRIDE)
-    listeners = Listeners(**{name: options.pop(name) for name in ("live", "monitor") if name in options})
+    listeners = Listeners(**{name: options.pop(name) for name in ("live", "monitor", "watched") if name in options})
     request = AcquisitionRequest(maps=maps, listeners=listeners, **{"silence_s": 0.2, **options})
     return Acquisition(rig, plan, timing, maker or FakeMaker(), request)
 

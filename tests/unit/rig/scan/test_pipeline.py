@@ -261,6 +261,30 @@ def test_the_monitor_sees_the_newest_block_small(tmp_path):
     assert stages.monitor_updates + stages.monitor_skipped_blocks <= N_BLOCKS
 
 
+def test_a_monitor_that_nobody_watches_sees_nothing_until_somebody_does():
+    rig, _ = rig_of()
+    views, looks = [], []
+
+    def watched():
+        looks.append(None)
+        return len(looks) > 1
+
+    unwatched = acquisition(rig, PLAN, MAPS, monitor=views.append, watched=lambda: False)
+    list(unwatched.run())
+    assert (views, unwatched.stages.monitor_updates) == ([], None)
+    rig, _ = rig_of()
+    acquired = acquisition(
+        rig,
+        PLAN,
+        MAPS,
+        maker=FakeMaker(lambda index: wait_until(lambda: len(looks) > 1)),
+        monitor=views.append,
+        watched=watched,
+    )
+    list(acquired.run())
+    assert len(views) == acquired.stages.monitor_updates >= 1
+
+
 def test_windows_are_shown_where_they_lie():
     block = STREAM.blocks(itertools.repeat(16))[0]
     records = block.records.copy()
