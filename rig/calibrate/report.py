@@ -30,7 +30,7 @@ from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.run_folder.charts import Panel, Series, chart_svg
-from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
+from rig.run_folder.pictures import Picture, Scale, depth_limits, png_bytes
 
 _STYLE = """
 body { font: 15px/1.45 Helvetica, Arial, sans-serif; color: #33404d; max-width: 860px; margin: 2em auto }
@@ -43,9 +43,6 @@ img { max-width: 100%; margin-top: 0.7em; image-rendering: auto } .small { color
 """
 
 _NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
-
-Picture = NDArray[np.uint8]
-
 
 Section = tuple[str, str]
 """A part of a report: its title, and its HTML."""
@@ -88,7 +85,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def picture(pixels: Picture, caption: str) -> str:
-    """Embed a picture, BGR or grey, with a caption below it."""
+    """Embed a picture with a caption below it."""
     data = base64.b64encode(png_bytes(pixels)).decode()
     return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">{paragraph(caption, small=True)}'
 
@@ -145,25 +142,25 @@ def subject(identity: Identity | None, board: Board | None, versions: Mapping[st
 
 
 _WIDTH_PX = 640
-_GROUND, _RIM, _INK = (255, 255, 255), (200, 194, 189), (77, 64, 51)
-_ERROR = (0, 94, 213)
-"""Colour of errors; colours here are BGR."""
-_COLOURS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159, 230), (233, 180, 86), (66, 228, 240))
+_GROUND, _RIM, _INK = (255, 255, 255), (189, 194, 200), (51, 64, 77)
+_ERROR = (213, 94, 0)
+"""Colour of errors; colours here are RGB."""
+_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (240, 228, 66))
 """Colours of the views, used in turn: those of Okabe and Ito, which the colour-blind can distinguish."""
 ARROW_TIMES = (1000, 500, 200, 100, 50, 20, 10, 5, 2, 1)
 
 
 def view_colour(view: int) -> tuple[int, int, int]:
-    """Colour (BGR) of a view in all pictures and charts, by its place among the views."""
+    """Colour (RGB) of a view in all pictures and charts, by its place among the views."""
     return _COLOURS[view % len(_COLOURS)]
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """Draw deviations of a board's squares from their plane, (squares down, across): red in front, black where NaN."""
+    """Draw deviations of a board's squares from their plane, (squares down, across): bright in front, black if NaN."""
     large = _enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
-    return depth_picture(large, (-most, most), unit="mm")
+    return Scale(-most, most, "mm", absent="no scan").picture(large)
 
 
 def _enlarged_mm(values_m: Array) -> NDArray[np.float32]:
@@ -186,7 +183,7 @@ def plane_residuals(judged: JudgedRig, sweeps: Sequence[SweepFit]) -> str:
     views, waves = list(dict.fromkeys(sweep.view for sweep in sweeps)), judged.waves
 
     def curve(sweep: SweepFit, values: Array) -> Series:
-        colour = "#{2:02x}{1:02x}{0:02x}".format(*view_colour(views.index(sweep.view)))
+        colour = "#{:02x}{:02x}{:02x}".format(*view_colour(views.index(sweep.view)))
         depth_mm = values * judged.sensitivity.per_command_m * 1e3
         return Series("", colour, list(zip(waves.command.tolist(), depth_mm.tolist(), strict=True)), marker=False)
 
@@ -245,13 +242,13 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
-    """Section with a picture of the expected depth error: red where it is large, black where no scan reaches."""
+    """Section with a picture of the expected depth error: bright where it is large, black where no scan reaches."""
     if not np.isfinite(uncertainty.sd_m).any():
         return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
     large = _enlarged_mm(uncertainty.sd_m)
-    limits = depth_limits(large)
-    drawn = depth_picture(large, None if limits is None else (limits[1], limits[0]), unit="mm")  # red: large
+    low, high = depth_limits(large) or (0.0, 1.0)
+    drawn = Scale(high, low, "mm", "inferno", absent="no scan").picture(large)
     rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
     said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
     return "Expected depth error", picture(drawn, caption) + said
@@ -278,7 +275,7 @@ def check_report(boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty |
     """Make the report on a check of a calibration."""
     sections = []
     for board in boards:
-        caption = "How far the board's squares lie off their plane, negative and red: in front; black: not scanned."
+        caption = "How far the board's squares lie off their plane, negative and bright: in front; black: not scanned."
         rows = [
             ("flatness", f"rms {mm(board.flatness_rms_m)}, expected {mm(board.expected_m)}; peak "
                          f"{mm(board.flatness_peak_m)}"),
@@ -357,21 +354,18 @@ def _decisions_section(fit: RigFit) -> Section:
 _NEW, _OLD, _LIMIT = "#0072b2", "#7b8896", "#d55e00"
 _BINS = 60
 _MOST_LISTED = 40
-_DEAD_BGR = (0, 0, 0)
 
 
 def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
-    """Dark rates as a picture, uint8 BGR (rows, width, 3): logarithmic, from a third of the ordinary rate upwards; dead
+    """Dark rates as a picture with its scale: logarithmic, from a third of the ordinary rate upwards, in counts/s; dead
     pixels are black.
     """
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)
-    share = np.log(np.clip(rate, low, high) / low) / np.log(high / low)
-    coloured = np.asarray(cv2.applyColorMap(np.round(255 * share).astype(np.uint8), cv2.COLORMAP_INFERNO), np.uint8)
     if pixels.dead is not None:
-        coloured[pixels.dead] = _DEAD_BGR
-    return coloured
+        rate = np.where(pixels.dead, np.nan, rate)
+    return Scale(high, low, "/s", "inferno", absent="dead", log=True).picture(rate)
 
 
 def pixel_page(
@@ -385,7 +379,10 @@ def pixel_page(
     and what changed since (`drift`). Both are None without an older map."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
-    caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
+    caption = (
+        f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale; dead "
+        "pixels are black."
+    )
     sections = [
         ("Dark rate", picture(dark_rate_picture(pixels), caption)),
         ("Distribution", rate_chart(pixels, None if against is None else against.pixels)),

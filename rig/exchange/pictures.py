@@ -7,11 +7,12 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.files.npy_files import load_arrays
 from drivers.frames import FrameBlock
 from rig.errors import UsageError
 from rig.exchange.npy import MapFiles, load
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.pictures import depth_limits, depth_picture, png_bytes
+from rig.run_folder.pictures import Picture, beside, confidence_picture, depth_limits, depth_picture, png_bytes
 from rig.scan.monitor import add_frames
 
 View = Literal["depth", "intensity", "frames"]
@@ -20,12 +21,11 @@ _BRIGHT_SHARE: Final = 0.999
 """Quantile of the first picture's pixel values that is shown as white."""
 _MOST_PIXELS: Final = 1 << 24
 """Most pixels of a picture of frames: five times as many as the largest SPAD array has."""
-Picture = NDArray[np.uint8]
-"""Grey (height, width) or BGR (height, width, 3)."""
 
 
 def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
-    """Make one picture of each map. The colour scale of the first depth map with any depth is kept for all later ones.
+    """Make one picture of each map: of its depth, with its confidence beside it if the folder holds that, or of its
+    intensity. The colour scale of the first depth map with any depth is kept for all later ones.
 
     Raises UsageError if a file cannot be read."""
     if view == "intensity":
@@ -41,7 +41,11 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
     for file in maps.files("depth", ".npy"):
         depth_m = load(file)
         limits = limits or depth_limits(depth_m)
-        yield depth_picture(depth_m, limits)
+        picture = depth_picture(depth_m, limits)
+        worth = file.parent.parent / "confidence" / f"{file.stem}.npz"
+        if worth.exists():
+            picture = beside(picture, confidence_picture(load(worth, load_arrays)["confidence"]))
+        yield picture
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:
@@ -73,7 +77,7 @@ def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) ->
     n = 0
     try:
         for picture in pictures:
-            frame = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture
+            frame = np.repeat(picture[:, :, None], 3, axis=2) if picture.ndim == 2 else picture[..., ::-1]
             height, width = frame.shape[:2]
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)))  # the format asks for even sides
             if film is None:

@@ -1,6 +1,7 @@
 """The folder of a run: every output in one place.
 
-    depth/000000.npy  depth/000000.png  intensity/000000.png  stripe/000000.npz  cloud/000000.ply
+    depth/000000.npy  depth/000000.png  confidence/000000.npz  confidence/000000.png
+    intensity/000000.png  stripe/000000.npz  cloud/000000.ply
     learned/000000.npz (the state used for the map, if the estimator learns)
     truth/000000.npz (if a world knows it)  manifest.json  summary.json
 
@@ -37,7 +38,15 @@ from rig.errors import UsageError
 from rig.estimate.registry import Learned
 from rig.estimate.row.model import RowModel
 from rig.run_folder.manifest import MANIFEST, sealed_text
-from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
+from rig.run_folder.pictures import (
+    cloud,
+    confidence_picture,
+    depth_limits,
+    depth_picture,
+    intensity_picture,
+    ply_bytes,
+    png_bytes,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -93,6 +102,10 @@ class RunFolder:
             np.save(depth, result.depth_m, allow_pickle=False)
             files[f"depth/{name}.npy"] = depth.getvalue()
             files[f"depth/{name}.png"] = png_bytes(depth_picture(result.depth_m, self._limits))
+            # Three digits are more than is known of either, and half as many bytes.
+            worth = {"confidence": result.confidence, "depth_sd_m": result.depth_sd_m}
+            files[f"confidence/{name}.npz"] = _npz_bytes({key: each.astype(np.float16) for key, each in worth.items()})
+            files[f"confidence/{name}.png"] = png_bytes(confidence_picture(result.confidence))
             files[f"cloud/{name}.ply"] = ply_bytes(cloud(result.depth_m, *rays, result.intensity))
         self._write(files)
 

@@ -1,19 +1,116 @@
-"""Pictures and point clouds of maps: depth in colour with its scale, intensity in grey, and PLY files.
+"""Pictures and point clouds of maps: depth and confidence in colour with a scale, counts in grey, and PLY files.
 
-Pictures are for people; the numbers are in the .npy files. Point clouds are binary PLY, little endian: x y z in metres
-in the camera's frame, and the intensity of each pixel.
+Pictures are for people; the numbers are in the .npy files. A picture is uint8, grey (rows, width) or RGB (rows, width,
+3). The colours of a `Scale` get darker from one end to the other, so they can be read by the colour-blind and from a
+grey print. Black is darker than all of them and always means that there is no value.
+
+Point clouds are binary PLY, little endian: x y z in metres in the camera's frame, and the intensity of each pixel.
 """
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.geometry.windows import WORD_PX
 
+Picture = NDArray[np.uint8]
+"""Grey (rows, width) or RGB (rows, width, 3)."""
 SCALE_PX = 74
-"""Width of the strip beside a depth picture that holds its scale."""
+"""Width of the strip beside a picture that holds its scale."""
 _BAR_PX = 14
 _TEXT_HEIGHT_PX = 10
 _LABELS = 6
+_LEGEND_ROWS = 100
+"""Pictures with fewer rows than this have no room for the sample of 'no value' below the scale."""
+_PAPER, _INK = (255, 255, 255), (51, 64, 77)
+NO_VALUE: Final = (0, 0, 0)
+"""Colour of pixels without a value."""
+Palette = Literal["viridis", "cividis", "inferno"]
+"""Colour maps whose lightness rises from end to end: viridis (van der Walt and Smith 2015), cividis (Nunez and others
+2018) and inferno. The first two look much alike to people with normal and with red-green deficient sight."""
+_DARKEST: Final[dict[Palette, int]] = {"viridis": 48, "cividis": 48, "inferno": 90}
+"""Level of each colour map, of 0 to 255, with which scales begin: their lightness L* is 28 or more, that of black 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Colours of values from `bright` to `dark`, the values at the upper and the lower end of the scale.
+
+    unit: written behind the labels. absent: short name of pixels without a value. log: whether the scale is
+    logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values.
+    """
+
+    bright: float
+    dark: float
+    unit: str = ""
+    palette: Palette = "viridis"
+    absent: str = "none"
+    log: bool = False
+    labels: Sequence[tuple[float, str]] = ()
+
+    def colours(self, values: NDArray[np.floating]) -> Picture:
+        """RGB, uint8 (..., 3), of values (...); `NO_VALUE` for NaN. Values beyond an end have that end's colour."""
+        known = np.isfinite(values)
+        levels = 1 + np.round(254 * np.clip(self._share(np.where(known, values, self.dark)), 0, 1)).astype(np.uint8)
+        return _palette(self.palette)[np.where(known, levels, 0)]
+
+    def picture(self, values: NDArray[np.floating]) -> Picture:
+        """The colours of values (rows, width), with the scale at the right: RGB (rows, width + SCALE_PX, 3)."""
+        import cv2
+
+        rows, width = values.shape
+        picture = np.empty((rows, width + SCALE_PX, 3), np.uint8)
+        picture[:, :width], picture[:, width:] = self.colours(values), _PAPER
+        top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
+        left = width + 8
+
+        def write(text: str, y: int) -> None:
+            at = (left + _BAR_PX + 6, min(max(y + _TEXT_HEIGHT_PX // 2, _TEXT_HEIGHT_PX), rows - 2))
+            cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.38, _INK, 1, cv2.LINE_AA)
+
+        if rows >= _LEGEND_ROWS:
+            picture[bottom - _BAR_PX : bottom, left : left + _BAR_PX] = NO_VALUE
+            write(self.absent, bottom - _BAR_PX // 2)
+            bottom -= 2 * _BAR_PX
+        shares = np.linspace(1, 0, bottom - top)
+        picture[top:bottom, left : left + _BAR_PX] = _palette(self.palette)[
+            1 + np.round(254 * shares).astype(int), None
+        ]
+        for value, text in self.labels or self._round_labels(rows):
+            y = top + round((1 - float(self._share(np.array(value)))) * (bottom - top - 1))
+            cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), _INK, 1)
+            write(text, y)
+        return picture
+
+    def _share(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Place of values on the scale, 0 at `dark` and 1 at `bright`."""
+        if self.log:
+            ends = np.log(self.bright), np.log(self.dark)
+            return np.asarray((np.log(np.maximum(values, 1e-30)) - ends[1]) / (ends[0] - ends[1]))
+        return np.asarray((values - self.dark) / (self.bright - self.dark))
+
+    def _round_labels(self, rows: int) -> list[tuple[float, str]]:
+        low, high = sorted((self.bright, self.dark))
+        if self.log:
+            powers = range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)
+            return [(10.0**power, f"{10.0**power:g} {self.unit}".rstrip()) for power in powers]
+        return [(value, f"{value:.4g} {self.unit}".rstrip()) for value in
+                round_values(low, high, min(_LABELS, max(1, rows // 40)))]  # fmt: skip
+
+
+@cache
+def _palette(name: Palette) -> Picture:
+    """RGB (256, 3) from dark to bright; the first entry is `NO_VALUE`."""
+    import cv2
+
+    code = {"viridis": cv2.COLORMAP_VIRIDIS, "cividis": cv2.COLORMAP_CIVIDIS, "inferno": cv2.COLORMAP_INFERNO}[name]
+    levels = np.linspace(_DARKEST[name], 255, 255).round().astype(np.uint8)
+    colours = np.asarray(cv2.applyColorMap(levels[:, None], code)[:, 0, ::-1], np.uint8)
+    return np.vstack([np.array([NO_VALUE], np.uint8), colours])
 
 
 def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
@@ -26,74 +123,102 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
     return low - spare, high + spare
 
 
-def depth_picture(
-    depth_m: NDArray[np.float32], limits: tuple[float, float] | None, unit: str = "m"
-) -> NDArray[np.uint8]:
-    """Depth in colours, from red (near) to blue (far), black where there is none, with a scale at the right; all black
-    without limits. uint8 BGR (rows, width + SCALE_PX, 3)."""
-    import cv2
+def depth_scale(limits: tuple[float, float] | None) -> Scale:
+    """The scale of depths between the limits of `depth_limits`: near is bright. Any scale if there are no limits."""
+    near_m, far_m = limits or (0.0, 1.0)
+    return Scale(near_m, far_m, "m", absent="no depth")
 
-    rows, width = depth_m.shape
-    picture = np.zeros((rows, width + SCALE_PX, 3), np.uint8)
+
+_TICKS: Final = ("0", "0.5", "0.9", "0.99", "0.999")
+CONFIDENCE_SCALE: Final = Scale(
+    1e-3, 1.0, palette="cividis", absent="no depth", log=True,
+    labels=tuple((1 - float(text), text) for text in _TICKS),
+)  # fmt: skip
+"""Scale of doubt, 1 - confidence, with labels of confidence: from 0.999 on all is bright."""
+
+
+def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | None) -> Picture:
+    """Depth (rows, width) in colours from bright (near) to dark (far), black where there is none, with the scale at the
+    right. All black, without a scale, if limits is None."""
     if limits is None:
-        return picture
-    low, high = limits
-    known = np.isfinite(depth_m)
-    if known.any():  # no pixel is if all frames were lost; then limits are those of an earlier map
-        picture[:, :width][known] = _colours(depth_m[known], limits)
-    top, bottom = min(12, rows // 8), max(rows - 12, rows - rows // 8)
-    bar = np.linspace(low, high, bottom - top)
-    left = width + 8
-    picture[top:bottom, left : left + _BAR_PX] = _colours(bar, limits)[:, None]
-    for value in round_values(min(limits), max(limits), min(_LABELS, max(1, rows // 40))):
-        y = top + round((value - low) / (high - low) * (bottom - top - 1))
-        cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), (255, 255, 255), 1)
-        at = (left + _BAR_PX + 6, min(max(y + _TEXT_HEIGHT_PX // 2, _TEXT_HEIGHT_PX), rows - 2))
-        cv2.putText(picture, f"{value:.4g} {unit}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.38, (255, 255, 255), 1, cv2.LINE_AA)
-    return picture
+        return np.zeros((len(depth_m), depth_m.shape[1] + SCALE_PX, 3), np.uint8)
+    return depth_scale(limits).picture(depth_m)
 
 
-def intensity_picture(intensity: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Summed counts as grey, uint8 (rows, width): square roots, so that shot noise looks alike in dark and bright."""
-    level = _without_window_steps(intensity)
-    # The brightest 0.5 % (hot pixels, glints) must not darken the rest, and haze over all pixels not wash it out.
-    low, high = np.percentile(level, [1, 99.5])
-    root = np.sqrt(np.clip(level - low, 0, None))
-    top = max(float(np.sqrt(high - low)), 1.0)
-    grey: NDArray[np.uint8] = np.clip(root * (255.0 / top) + 0.5, 0, 255).astype(np.uint8)
-    return grey
+def confidence_picture(confidence: NDArray[np.floating]) -> Picture:
+    """Confidence (rows, width) of a map's depths in colours, bright where it is certain, black where it is 0 or NaN,
+    with a scale at the right that spreads what lies close to 1."""
+    return CONFIDENCE_SCALE.picture(doubt(confidence))
 
 
-def png_bytes(picture: NDArray[np.uint8]) -> bytes:
-    """A picture, grey (rows, width) or BGR (rows, width, 3), as a PNG file. Raises ValueError if that fails."""
+def doubt(confidence: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The values of `CONFIDENCE_SCALE`: 1 - confidence, NaN where confidence is 0 (no depth) or NaN."""
+    return np.where(confidence > 0, np.maximum(1 - confidence, 1e-6), np.nan)
+
+
+_LOCAL_SHARE: Final = 0.65
+"""Share of the contrast with the surroundings in a picture of counts; the rest is the contrast of the whole picture."""
+_AROUND: Final = 10
+"""A pixel's surroundings have a standard deviation of one in so many of the picture's longer side."""
+_LEAST_SPREAD: Final = 0.7
+"""Spread of levels below which a place counts as flat, in standard deviations of the shot noise of one pixel."""
+_SHRINK: Final = 8
+
+
+def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
+    """Summed counts as grey (rows, width), stretched so that objects stand out from fog.
+
+    The light of fog changes slowly over the picture and hides what is behind it in a stretch of the whole. So levels
+    are mainly compared with their surroundings. They are square roots, in which shot noise is the same in dark and
+    bright; hot pixels are replaced by the median of their neighbours.
+    """
     import cv2
 
-    done, data = cv2.imencode(".png", picture)
+    level = _without_window_steps(2 * np.sqrt(intensity.astype(np.float32) + 0.375))
+    level = cv2.GaussianBlur(cv2.medianBlur(level, 3), (0, 0), 0.8)
+    rows, width = level.shape
+    small = max(1, width // _SHRINK), max(1, rows // _SHRINK)
+    sigma = max(small) / _AROUND
+
+    def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        shrunk = cv2.GaussianBlur(cv2.resize(values, small, interpolation=cv2.INTER_AREA), (0, 0), sigma)
+        return np.asarray(cv2.resize(shrunk, (width, rows), interpolation=cv2.INTER_LINEAR), np.float32)
+
+    off = level - around(level)
+    local = off / np.maximum(np.sqrt(around(off * off)), _LEAST_SPREAD)
+    both = _LOCAL_SHARE * _stretched(local) + (1 - _LOCAL_SHARE) * _stretched(level)
+    return np.asarray(np.round(255 * both), np.uint8)
+
+
+def _stretched(level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Levels as 0 to 1 between their 1st and 99.5th percentile."""
+    low, high = np.percentile(level, [1, 99.5])
+    return np.clip((level - low) / max(float(high - low), _LEAST_SPREAD), 0, 1)
+
+
+def beside(left: Picture, right: Picture) -> Picture:
+    """Two RGB pictures of the same number of rows, side by side."""
+    return np.hstack([left, right])
+
+
+def png_bytes(picture: Picture) -> bytes:
+    """A picture, grey (rows, width) or RGB (rows, width, 3), as a PNG file. Raises ValueError if that fails."""
+    import cv2
+
+    done, data = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
     if not done:
         raise ValueError(f"a picture of shape {picture.shape} cannot be written as PNG")
     return bytes(data)
 
 
-def _without_window_steps(intensity: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Counts as floats, without the steps at multiples of 64 px, where windows and the haze in them begin or end."""
-    level = intensity.astype(np.float64)
+def _without_window_steps(level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Levels without the steps at multiples of 64 px, where windows and the haze in them begin or end."""
+    level = level.copy()
     reach = 3
     for edge in range(WORD_PX, level.shape[1] - reach, WORD_PX):
         before, after = level[:, edge - reach : edge].mean(axis=1), level[:, edge : edge + reach].mean(axis=1)
         level[:, edge:] -= np.median(after - before)
     return level
-
-
-def _colours(depth_m: NDArray[np.floating], limits: tuple[float, float]) -> NDArray[np.uint8]:
-    """BGR (n, 3) of depths (n,)."""
-    import cv2
-
-    low, high = limits
-    share = np.clip((high - depth_m) / (high - low), 0, 1)
-    # Both ends of the colour map are nearly black; black means 'no depth' here.
-    levels = np.round(20 + 225 * share).astype(np.uint8)
-    colours: NDArray[np.uint8] = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0]
-    return colours
 
 
 def round_values(low: float, high: float, most: int) -> list[float]:

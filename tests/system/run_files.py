@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 FILES = {
-    "depth/000000.npy", "depth/000000.png", "intensity/000000.png", "stripe/000000.npz", "cloud/000000.ply",
-    "truth/000000.npz", "manifest.json", "summary.json",
+    "depth/000000.npy", "depth/000000.png", "confidence/000000.npz", "confidence/000000.png", "intensity/000000.png",
+    "stripe/000000.npz", "cloud/000000.ply", "truth/000000.npz", "manifest.json", "summary.json",
 }  # fmt: skip
 
 

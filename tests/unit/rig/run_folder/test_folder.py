@@ -16,7 +16,7 @@ from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.geometry.stripe_table import StripeTable
 from rig.recording.writer import Recording
 from rig.run_folder.folder import RunFolder, json_text
-from rig.run_folder.pictures import SCALE_PX, depth_picture
+from rig.run_folder.pictures import SCALE_PX
 from tests.unit.rig.recording.recorded import run_blocks
 
 ROWS, WIDTH, COLUMNS = 40, 60, 7
@@ -84,17 +84,20 @@ def test_a_map_is_written_in_formats_others_read(tmp_path: Path) -> None:
     assert {file.name for file in tmp_path.iterdir()} == {"run"}
 
 
-def test_the_depth_picture_is_black_where_there_is_no_depth_and_red_where_it_is_near(tmp_path: Path) -> None:
+def test_the_depth_picture_is_black_where_there_is_no_depth_and_bright_where_it_is_near(tmp_path: Path) -> None:
     run = published(tmp_path / "run", a_map())
     picture = cv2.imread(str(run / "depth/000000.png"))
     assert picture.shape == (ROWS, WIDTH + SCALE_PX, 3)
     assert not picture[5:9, 10:20].any()
     near, far = picture[20, 10].astype(int), picture[20, 50].astype(int)
-    assert near[2] > 100 > near[0]
-    assert far[0] > 100 > far[2]
+    assert near.sum() > far.sum() + 200 > 300
     assert picture[:, WIDTH:].any()
-    nothing = depth_picture(np.full((40, 30), np.nan, np.float32), (1.0, 8.0))  # after others
-    assert (nothing[:, :30].any(), nothing[:, 30:].any()) == (False, True)
+    worth = np.load(run / "confidence/000000.npz")
+    np.testing.assert_array_equal(worth["confidence"] > 0, picture[:, :WIDTH].any(axis=2))
+    np.testing.assert_allclose(worth["depth_sd_m"][20, [10, 50]], [0.02, 0.04], rtol=1e-3)
+    sure = cv2.imread(str(run / "confidence/000000.png"))
+    assert sure.shape == picture.shape
+    np.testing.assert_array_equal(sure[:, :WIDTH].any(axis=2), picture[:, :WIDTH].any(axis=2))
     grey = cv2.imread(str(run / "intensity/000000.png"), cv2.IMREAD_UNCHANGED)
     assert (grey.shape, grey.dtype) == ((ROWS, WIDTH), np.uint8)
 
@@ -197,7 +200,7 @@ def test_an_empty_folder_is_filled_stays_when_nothing_comes_of_it_and_is_left_to
     assert list(out.iterdir()) == [out / "summary.json"]
     (out / "summary.json").unlink()
     assert published(out, a_map()) == out
-    assert {file.name for file in out.iterdir()} == {"depth", "intensity", "stripe", "cloud"}
+    assert {file.name for file in out.iterdir()} == {"depth", "confidence", "intensity", "stripe", "cloud"}
     assert published(tmp_path / "deep/er/run", a_map()).exists()
 
 
