@@ -1,4 +1,4 @@
-"""The implementations every conformance suite runs over: one factory each, by name.
+"""The implementations over which the suites of `spadrig.conformance` run: one factory each, by name.
 
 A new device gets its factory in `devices.py` or `spads.py`, a new simulated one below, as
 `"NAME": partial(simulated_device, slot="laser", kind="NAME")`. It then has to behave like all the others.
@@ -18,9 +18,9 @@ import yaml
 from drivers.clock import VirtualClock
 from drivers.interfaces import MARKER_SCAN, ScanWaveform, SpadRequest, WindowTable
 from drivers.registry import Surroundings, lookup
-from tests.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, run
+from spadrig.conformance.cases import LaserCase, ScannerCase, SpadCase, SyncCase, Taken, take
 from tests.conformance.devices import LASERS, SCANNERS, SYNCS, Factory
-from tests.conformance.spads import EMULATED, N_FRAMES, replayed_spads
+from tests.conformance.spads import EMULATED, replayed_spads
 from tests.system.small_rig import calibration
 
 ROWS, WIDTH = 24, 100
@@ -96,9 +96,7 @@ def over(factories: dict[str, Factory]) -> Any:
 def taken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Taken]:
     """One run of each SPAD array to its end, its blocks all still in the ring."""
     with request.param(tmp_path_factory.mktemp("taken")) as case:
-        timing = case.device.configure(case.request)
-        ring, blocks = run(case, timing, N_FRAMES)
-        yield Taken(case, timing, ring, blocks, case.device.counters)
+        yield take(case)
 
 
 spad = over(SPADS)

@@ -23,7 +23,7 @@ from sim_backend.wire.firmware.helios import DacModel, HeliosModel
 from sim_backend.wire.firmware.ibeam import IbeamModel
 from sim_backend.wire.firmware.obis import ObisModel
 from sim_backend.wire.serve.serial import SerialServer
-from tests.conformance.cases import LaserCase, ScannerCase, SyncCase
+from spadrig.conformance.cases import LaserCase, ScannerCase, SyncCase
 from tests.wire.emulated_lasers import USUAL, eventually, open_cobolt, open_ibeam, open_obis, wire
 from tests.wire.emulated_scanners import opened
 from tests.wire.emulated_syncs import Board, PulseBox, board, pulse_box, teensy

@@ -21,14 +21,12 @@ from sim_backend.wire.firmware.spad512s import Spad512sModel
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
 from sim_backend.wire.serve.tcp import TcpServer
-from tests.conformance.cases import SpadCase, run
+from spadrig.conformance.cases import N_FRAMES, SpadCase, run
 from tests.wire.emulated_lasers import PATIENCE_S
 from tests.wire.spb_device import HEIGHT, REQUEST, WIDTH, TiledSource, opened
 
 Factory = Callable[[Path], AbstractContextManager[SpadCase]]
 
-N_FRAMES = 500
-"""Frames of a run of the suite."""
 _NOISE = np.random.default_rng(1).integers(0, 256, (64, 512, 64), dtype=np.uint8)
 
 

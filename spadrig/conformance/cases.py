@@ -1,4 +1,7 @@
-"""What a conformance suite needs of an implementation besides the device: time to pass, and a look from outside."""
+"""The cases that conformance suites are given: a device that is open, and functions that observe it from outside.
+
+A case says, for example, whether there is really light. The suites never believe the device alone.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +25,9 @@ from drivers.interfaces import (
 from drivers.ring import BlockRing
 
 TIMEOUT_S = 60.0
+"""Longest wait for a block."""
+N_FRAMES = 500
+"""Frames of the run whose blocks the suite of SPADs looks at."""
 
 
 def require_final(device: Device, *verbs: Callable[[], object]) -> None:
@@ -64,6 +70,13 @@ def run(case: SpadCase, timing: SpadTiming, n_frames: int) -> tuple[BlockRing, l
         assert case.device.state is DeviceState.RUNNING
     ring.finish()
     return ring, list(reader)
+
+
+def take(case: SpadCase) -> Taken:
+    """Configure a SPAD array and run it to its end."""
+    timing = case.device.configure(case.request)
+    ring, blocks = run(case, timing, N_FRAMES)
+    return Taken(case, timing, ring, blocks, case.device.counters)
 
 
 @dataclass(frozen=True)
