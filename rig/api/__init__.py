@@ -18,6 +18,7 @@ from spadrig.names import require_own_names
 
 require_own_names()  # here too: another package `rig` may have overwritten only `rig/__init__.py`
 
+from rig.api.quality import quality
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
 from rig.api.scan import plan_scan, reconstruct, replay, scan
@@ -93,6 +94,7 @@ __all__ = [
     "laser_off",
     "plan_scan",
     "plan_text",
+    "quality",
     "reconstruct",
     "recording_info",
     "repair",

@@ -188,7 +188,7 @@ def _option_name(field: "Field[Any]") -> str:
     return f"--{(field.metadata['name'] or field.name).replace('_', '-')}"
 
 
-_OPTIONS = {name: f"--{name}" for name in ("like", "plan", "row", "column")} | {
+_OPTIONS = {name: f"--{name}" for name in ("like", "plan", "region", "row", "column")} | {
     field.name: _option_name(field)
     for request in vars(requests).values()
     if is_dataclass(request) and isinstance(request, type)

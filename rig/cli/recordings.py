@@ -146,6 +146,19 @@ def runs_command(
     return Answer(content, lambda: tables.runs_table(found))
 
 
+def quality_command(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run with depth maps", show_default=False)],
+    region: Annotated[
+        str | None,
+        typer.Option("--region", metavar="x0,y0,x1,y1", help="pixels of a flat surface", show_default="all pixels"),
+    ] = None,
+) -> Answer:
+    """Judge depth without a truth: how flat a flat region comes out, how full, and how repeatable over maps."""
+    with progress(compiles=False):
+        found = api.quality(run, region)
+    return Answer(asdict(found), lambda: tables.quality_table(found))
+
+
 @asks(ImportRequest)
 def import_command(
     request: ImportRequest,
@@ -231,6 +244,7 @@ def _follow(pace: "Pace", handle: int) -> None:
 
 COMMANDS: Commands = {
     "runs": runs_command,
+    "quality": quality_command,
     "verify": verify_command,
     "repair": repair_command,
     "info": info_command,

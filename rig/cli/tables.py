@@ -16,6 +16,7 @@ from rig.bench.frames import COLUMNS
 from rig.bench.soak import SoakReport
 from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
 from rig.cli.command import in_options
+from rig.depth.quality import RegionQuality
 from rig.run_folder.runs import DAMAGED, RunEntry
 from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
 from rig.run_folder.time_of_day import RunTime
@@ -278,6 +279,33 @@ def _size(count: int) -> str:
 def _one_line(text: str) -> str:
     line = " ".join(text.split())
     return line if len(line) <= _NOTE_CHARACTERS else f"{line[: _NOTE_CHARACTERS - 3]}..."
+
+
+def quality_table(found: RegionQuality) -> None:
+    """Print the quality of a region's depth to stdout."""
+
+    def mm(value: float | None) -> str:
+        return "-" if value is None else f"{digits(1e3 * value)} mm"
+
+    plane = f"no plane in any of {found.maps} maps: too few pixels with depth, or they lie on a line"
+    if found.planes:
+        plane = (
+            f"rms {mm(found.plane_rms_m)} from a plane, {_percent(found.plane_outliers)} outliers left out; at "
+            f"{_number(found.plane_distance_m, 4)} m, tilted by {_number(found.tilt_deg)} deg"
+        )
+    temporal = "needs at least two maps"
+    if found.maps > 1:
+        temporal = f"sd of a pixel over maps {mm(found.temporal_sd_m)} (median), {mm(found.temporal_rms_m)} (rms)"
+        temporal += f"; of the plane {mm(found.plane_distance_sd_m)}"
+    least = f", {_percent(found.fill_rate_least)} in the worst map" if found.maps > 1 else ""
+    _print_pairs(
+        [
+            ("region", f"{found.pixels} pixels, {found.maps} maps, {_number(found.depth_m, 4)} m deep (median)"),
+            ("filled", f"{_percent(found.fill_rate)} of the pixels have a depth{least}"),
+            ("flatness", plane),
+            ("repeatability", temporal),
+        ]
+    )
 
 
 WIDTH = 80

@@ -7,6 +7,7 @@ grey print. Black is darker than all of them and always means that there is no v
 Point clouds are binary PLY, little endian: x y z in metres in the camera's frame, and the intensity of each pixel.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -54,9 +55,15 @@ class Scale:
 
     def colours(self, values: NDArray[np.floating]) -> Picture:
         """RGB, uint8 (..., 3), of values (...); `NO_VALUE` for NaN. Values beyond an end have that end's colour."""
-        known = np.isfinite(values)
-        levels = 1 + np.round(254 * np.clip(self._share(np.where(known, values, self.dark)), 0, 1)).astype(np.uint8)
-        return _palette(self.palette)[np.where(known, levels, 0)]
+        import cv2
+
+        values = np.asarray(values, np.float32)
+        share = self._share(values)
+        # NaN stays NaN in `clip`, and is nothing that a level can be made of.
+        levels = np.nan_to_num(np.clip(share, 0, 1, out=share) * np.float32(254) + np.float32(1.5)).astype(np.uint8)
+        table = _palette(self.palette)[:, None]
+        flat = cv2.applyColorMap(np.ascontiguousarray(levels.reshape(-1, 1)), table)
+        return np.asarray(flat, np.uint8).reshape(*values.shape, 3)
 
     def picture(self, values: NDArray[np.floating]) -> Picture:
         """The colours of values (rows, width), with the scale at the right: RGB (rows, width + SCALE_PX, 3)."""
@@ -89,8 +96,8 @@ class Scale:
     def _share(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """Place of values on the scale, 0 at `dark` and 1 at `bright`."""
         if self.log:
-            ends = np.log(self.bright), np.log(self.dark)
-            return np.asarray((np.log(np.maximum(values, 1e-30)) - ends[1]) / (ends[0] - ends[1]))
+            per_e = 1 / math.log(self.bright / self.dark)
+            return np.asarray(np.log(np.maximum(values, np.float32(1e-30)) / self.dark) * per_e)
         return np.asarray((values - self.dark) / (self.bright - self.dark))
 
     def _round_labels(self, rows: int) -> list[tuple[float, str]]:
@@ -153,7 +160,7 @@ def confidence_picture(confidence: NDArray[np.floating]) -> Picture:
 
 def doubt(confidence: NDArray[np.floating]) -> NDArray[np.floating]:
     """The values of `CONFIDENCE_SCALE`: 1 - confidence, NaN where confidence is 0 (no depth) or NaN."""
-    return np.where(confidence > 0, np.maximum(1 - confidence, 1e-6), np.nan)
+    return np.where(confidence > 0, np.maximum(1 - confidence, np.float32(1e-6)), np.float32(np.nan))
 
 
 _LOCAL_SHARE: Final = 0.65
@@ -255,3 +262,10 @@ def ply_bytes(points: NDArray[np.void]) -> bytes:
         f"element vertex {len(points)}\n{properties}end_header\n"
     )
     return header.encode("ascii") + points.tobytes()
+
+
+def ply_points(ply: bytes) -> NDArray[np.void] | None:
+    """The points, of dtype POINT, of a file that `ply_bytes` made; None if it is another one."""
+    header, end, body = ply.partition(b"end_header\n")
+    whole = bool(end) and b"binary_little_endian" in header and len(body) % POINT.itemsize == 0
+    return np.frombuffer(body, POINT) if whole else None
