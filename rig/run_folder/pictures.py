@@ -199,7 +199,7 @@ def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
 
 def _stretched(level: NDArray[np.float32]) -> NDArray[np.float32]:
     """Levels as 0 to 1 between their 1st and 99.5th percentile."""
-    low, high = np.percentile(level, [1, 99.5])
+    low, high = np.percentile(level[::2, ::2], [1, 99.5])  # a quarter of the pixels tells, in a quarter of the time
     return np.clip((level - low) / max(float(high - low), _LEAST_SPREAD), 0, 1)
 
 
