@@ -22,6 +22,7 @@ from rig.api.quality import quality
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
 from rig.api.scan import plan_scan, reconstruct, replay, scan
+from rig.api.steering import OnMap, SeenMap
 from rig.api.tradeoff import tradeoff
 from rig.bench.soak import soak
 from rig.calibrate.camera import calibrate_camera
@@ -62,6 +63,7 @@ __all__ = [
     "CameraRequest",
     "CheckRequest",
     "Config",
+    "OnMap",
     "PathLike",
     "PixelsRequest",
     "PlanesRequest",
@@ -70,6 +72,7 @@ __all__ = [
     "RunResult",
     "RunsRequest",
     "ScanRequest",
+    "SeenMap",
     "SoakRequest",
     "SyncRequest",
     "TradeoffRequest",

@@ -1,6 +1,7 @@
 """The calls that make depth maps: `scan` with a rig; `replay` and `reconstruct` from existing frames; `plan_scan`."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
+from rig.api.steering import OnMap, Steering, note
 from rig.config.estimators import estimator_names, is_estimator
 from rig.config.files import load_cube_plan
 from rig.config.models import AUTO, CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
 from rig.devices.calibration_use import calibration_use, cube_calibration_use
-from rig.devices.open import light_problems, open_rig
+from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError, noted
 from rig.estimate.registry import FILTERS
@@ -29,7 +31,7 @@ from rig.recording.segment import Space
 from rig.requests import ReconstructRequest, ReplayRequest, RunRequest, ScanRequest
 from rig.run_folder.folder import SavePolicy
 from rig.run_folder.runs import label_problems
-from rig.run_folder.summary import MapTally
+from rig.run_folder.summary import MapTally, RunVerdict
 from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
 from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
@@ -46,6 +48,7 @@ def scan(
     live: Callable[[ScanProgress], None] | None = None,
     monitor: MonitorCallback | None = None,
     on_space: Callable[[Space], None] | None = None,
+    on_map: OnMap | None = None,
     **changes: Any,
 ) -> RunResult:
     """Scan with a rig and return its depth maps (`rig scan`).
@@ -56,6 +59,11 @@ def scan(
     monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
       the run never waits for it.
     on_space: called with a `Space` before anything moves: the most disk space that the recording will take.
+    on_map: called with each map, as a `SeenMap`, once it is written. It returns None, or settings for the scan of the
+      maps that are left: `{"exposures": 20, "power": "10 mW"}`, keys of the config's sections `scan` and `estimate`.
+      The scan at hand then ends with this map, everything is made safe, and the next one begins in a folder of its own,
+      NAME-2 and so on; the result is that of the last, with the others in `earlier`. Settings are checked as a config
+      is, so that no power goes beyond the laser's limit. A refused one ends the call with a UsageError in one line.
 
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
     frames cannot be written; maps finished by then are in `out`. An interrupt (Ctrl-C) ends the scan; its complete maps
@@ -63,11 +71,31 @@ def scan(
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
-    listeners = _listeners(progress, live, monitor, on_space)
-    with _new_run(settings, request) as run:
-        tap = run.start_tap() if request.record else None
-        with open_rig(settings, seed=request.seed, tap=tap) as rig, Feed("scan", settings.name) as feed:
-            return run_scan(rig, run, request, feed.listeners(listeners))
+    steering = Steering(on_map, settings, request)
+    listeners = replace(_listeners(progress, live, monitor, on_space), enough=steering.enough)
+    extra: dict[str, Any] = {}
+    results: list[RunResult] = []
+    with ExitStack() as kept:
+        rig: OpenRig | None = None
+        while True:
+            try:
+                with _new_run(settings, request) as run, ExitStack() as own:
+                    run.extra.update(extra)
+                    tap = run.start_tap() if request.record else None
+                    if rig is None or tap is not None:  # traffic is recorded from the opening of the devices on
+                        stack = own if on_map is None or tap is not None else kept
+                        rig = stack.enter_context(open_rig(settings, seed=request.seed, tap=tap))
+                    feed = own.enter_context(Feed("scan", settings.name))
+                    result = run_scan(replace(rig, config=settings), run, request, feed.listeners(listeners))
+            except Exception as error:
+                if results:
+                    note(error, results[-1])
+                raise
+            following = None if result.summary.verdict is RunVerdict.ABORTED else steering.next(result)
+            if following is None:
+                return replace(result, earlier=tuple(results))
+            results.append(result)
+            settings, request, extra = following
 
 
 def plan_scan(

@@ -59,7 +59,7 @@ def configure(
     given = {key: value for key, value in options.items() if value is not None}
     if not given:
         return loaded
-    return _changed(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
+    return with_settings(config, given) if isinstance(config, RigConfig) else load_config(os.fspath(config), given)
 
 
 def seed_problems(seed: int) -> list[str]:
@@ -69,7 +69,11 @@ def seed_problems(seed: int) -> list[str]:
     return [f"seed is {seed}; it must be 0 or more and at most 2^63 - 1 ({MAX_SEED})"]
 
 
-def _changed(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
+def with_settings(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
+    """A config with other values for some keys, by dotted name: {"scan.exposures": 4}. Values are written as in a file.
+
+    Raises UsageError with one line per problem.
+    """
     content = config.model_dump(mode="json")
     for key, value in options.items():
         section, name = key.split(".")

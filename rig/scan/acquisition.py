@@ -101,6 +101,8 @@ class Acquisition:
         self._counters_before = SpadCounters(0, 0, 0, 0, 0)
         self._frames_before = 0
         self._fog: FogEstimate | None = None
+        self.trouble: list[str] = []
+        """Lines on devices that could not be made safe, if the caller took no more maps and so got no error."""
 
     @property
     def counters(self) -> SpadCounters:
@@ -210,6 +212,9 @@ class Acquisition:
                 raise failure
             if trouble:
                 raise DevicesError("\n".join(trouble))
+        except GeneratorExit:
+            self.trouble = trouble
+            raise
         except BaseException as error:
             if not isinstance(error, DevicesError):
                 for line in trouble:

@@ -108,6 +108,7 @@ class Listeners:
     on_space: called with the room that a recording will take, before anything moves, once it is known to fit.
     begun: called once, on the caller's thread, before anything is compiled or moves.
     maps: called with each map once it is written and counted, on the caller's thread.
+    enough: called after `maps`; if it returns True, the run ends with this map.
     """
 
     live: Callable[[ScanProgress], None] | None = None
@@ -117,6 +118,7 @@ class Listeners:
     watched: Callable[[], bool] | None = None
     begun: Callable[[RunBegun], None] | None = None
     maps: Callable[[AcquiredMap], None] | None = None
+    enough: Callable[[AcquiredMap], bool] | None = None
 
     def tell(self, now: ScanProgress) -> None:
         """Report to `rig.progress` and `live` how far a scan is."""

@@ -40,6 +40,7 @@ class RunResult:
     truth: the truth of that map; None if it is not known.
     folder: where everything was written; None if nothing was.
     control: for a replay with drivers, the comparison of what they sent with the recording.
+    earlier: the scans before this one in the same call, if `on_map` changed settings.
     """
 
     summary: Summary
@@ -47,6 +48,7 @@ class RunResult:
     truth: SweepTruth | None
     folder: Path | None
     control: ControlCheck | None = None
+    earlier: tuple["RunResult", ...] = ()
 
     def uninterrupted(self) -> Self:
         """The result itself, for callers that need the whole run. Raises KeyboardInterrupt if an interrupt ended it."""
@@ -69,6 +71,8 @@ class Run:
     ) -> None:
         """Claim the folder. Raises UsageError if it cannot be written."""
         self.tally = tally
+        self.extra: dict[str, Any] = {}
+        """Further keys of the manifest."""
         self._folder = None if out is None else RunFolder(out, in_place=record)
         self.rays: Rays | None = None
         self.save = save or SavePolicy()

@@ -29,7 +29,7 @@ from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
 from rig.devices.open import OpenRig
 from rig.devices.prepare import lead_s, most_sweeps, prepare, spare_lead_s
-from rig.errors import RigError
+from rig.errors import DevicesError, RigError
 from rig.estimate.registry import LEARNING, Learned
 from rig.geometry.windows import SweepGeometry
 from rig.plan.compile import spad_request
@@ -110,6 +110,7 @@ def run_scan(
         "request": request_content(request),
         "note": request.note,
         "tags": list(request.tags),
+        **run.extra,
     }
 
     times = facts.times(timing)
@@ -153,6 +154,10 @@ def run_scan(
                 run.add(found.result, found.compute_s, truth)
                 if listeners.maps is not None:
                     listeners.maps(found)
+                if listeners.enough is not None and listeners.enough(found):
+                    break
+        if acquisition.trouble:
+            raise DevicesError("\n".join(acquisition.trouble))
     except (KeyboardInterrupt, DeviceError, RigError) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
