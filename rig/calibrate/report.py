@@ -1,15 +1,12 @@
 """Makes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
 `planes_report`, `camera_report`, `check_report` and `sync_report` make the parts of a report: tables, pictures and
-charts. `page` makes the file from these, `pixel_page` that on a pixel map; files load nothing from elsewhere. Numbers
-have units and only the digits that are known. `subject` says what a report is about, so that prints are not confused.
+charts. `report_page` makes the file from these, `pixel_page` that on a pixel map; the look is that of all reports
+(`rig.report.page`). `subject` says what a report is about, so that prints are not confused.
 """
 
-import base64
-import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from html import escape
 
 import cv2
 import numpy as np
@@ -29,72 +26,19 @@ from calibration.rig_fit.fit import RigFit, SweepFit
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
-from rig.run_folder.charts import Panel, Series, chart_svg
-from rig.run_folder.pictures import Picture, Scale, depth_limits, png_bytes
+from rig.report.charts import Panel, Series, chart_svg
+from rig.report.page import Rows, Section, page, paragraph, picture, table, verdict_box
+from rig.run_folder.pictures import Picture, Scale, depth_limits
 
-_STYLE = """
-body { font: 15px/1.45 Helvetica, Arial, sans-serif; color: #33404d; max-width: 860px; margin: 2em auto }
-h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin-top: 2em } p { margin: 0.5em 0 }
-.passed, .failed { padding: 0.6em 1em; margin-bottom: 1em; border-left: 6px solid; background: #f6f8fa }
-.passed { border-color: #009e73 } .failed { border-color: #d55e00 }
-table { border-collapse: collapse; font-size: 0.92em } td, th { padding: 0.15em 0.9em 0.15em 0; text-align: left }
-td.number, th.number { text-align: right; font-variant-numeric: tabular-nums }
-img { max-width: 100%; margin-top: 0.7em; image-rendering: auto } .small { color: #7b8896; font-size: 0.88em }
-"""
-
-_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
-
-Section = tuple[str, str]
-"""A part of a report: its title, and its HTML."""
 Report = tuple[str, Sequence[Section]]
 """A report's title and its parts."""
-Rows = Sequence[tuple[str, str]]
 
 
-def page(report: Report, verdict: Verdict, line: str, rows: Rows) -> str:
+def report_page(report: Report, verdict: Verdict, line: str, rows: Rows) -> str:
     """The text of the HTML file: verdict with the summary line and its reasons, a table of `rows`, the sections."""
-    title, sections = report
-    parts = [
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
-        f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>",
-        _verdict(verdict, line),
-        table(("", ""), rows) if rows else "",
-        *(f"<h2>{escape(name)}</h2>\n{body}" for name, body in sections),
-        "</body></html>\n",
-    ]
-    return "\n".join(parts)
-
-
-def paragraph(text: str, *, small: bool = False) -> str:
-    """Make a paragraph of plain text."""
-    kind = ' class="small"' if small else ""
-    return f"<p{kind}>{escape(text)}</p>"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Make a table. Columns of numbers (or dashes in their place) are aligned right."""
-    numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
-
-    def cells(row: Sequence[str], tag: str) -> str:
-        kinds = (' class="number"' if number else "" for number in numbers)
-        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
-
-    top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
-    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f"<table>{top}{body}</table>"
-
-
-def picture(pixels: Picture, caption: str) -> str:
-    """Embed a picture with a caption below it."""
-    data = base64.b64encode(png_bytes(pixels)).decode()
-    return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">{paragraph(caption, small=True)}'
-
-
-def _verdict(verdict: Verdict, line: str) -> str:
-    word = "passed" if verdict.passed else "failed"
-    reasons = "".join(f"<p>{escape(str(reason))}.</p>" for reason in verdict.reasons)
-    said = f"<p>{escape(line)}</p>" if line else ""
-    return f'<div class="{word}"><p><b>{word.upper()}</b></p>{said}{reasons}</div>'
+    word, reasons = "passed" if verdict.passed else "failed", [str(reason) for reason in verdict.reasons]
+    box = verdict_box(word, line, reasons, good=verdict.passed)
+    return page(report[0], [box, table(("", ""), rows) if rows else ""], report[1])
 
 
 _UNITS = {
@@ -396,7 +340,7 @@ def pixel_page(
         said = paragraph(f"Row and column of up to {_MOST_LISTED} pixels each.", small=True)
         sections.append(("Changed since the last map", table(("", ""), changes) + said))
     line = f"{int(pixels.defects.sum())} of {pixels.defects.size} pixels are not to be used."
-    return page(("Pixels", sections), verdict, line, rows)
+    return report_page(("Pixels", sections), verdict, line, rows)
 
 
 def rate_chart(pixels: PixelMap, older: PixelMap | None = None) -> str:

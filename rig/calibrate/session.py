@@ -35,7 +35,7 @@ from calibration.verdict import Verdict
 from calibration.views import Corners, Passages, View
 from drivers.json_text import parse_json
 from rig.calibrate.capture import Capture, TellLine
-from rig.calibrate.report import Report, page, subject
+from rig.calibrate.report import Report, report_page, subject
 from rig.calibrate.sources import VIEWS
 from rig.config.models import RigConfig
 from rig.devices.calibration_use import KnowsRig, carry_notes, same_rig
@@ -238,7 +238,9 @@ class Session:
                 carry_notes(*made_from, file, result.model)
             result = replace(result, calibration=self._folder.path / CALIBRATION_FILE)
         about = subject(self.identity, self.board, summary["versions"], datetime.now(UTC))
-        self._folder.write_text("report.html", page(report, result.verdict, result.line, [*result.figures, *about]))
+        self._folder.write_text(
+            "report.html", report_page(report, result.verdict, result.line, [*result.figures, *about])
+        )
         self._folder.write_json("summary.json", summary)
         self._folder.publish()
         return replace(result, folder=self._folder.path)

@@ -12,7 +12,7 @@ import yaml
 
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
-from rig.run_folder.charts import Panel, Series, chart_svg
+from rig.report.charts import Panel, Series, chart_svg
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.tradeoff.rows import Clock, TradeoffRow

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.estimate.registry import ESTIMATORS, FILTERS
-from rig.run_folder.charts import INK, Panel, Point, Series, chart_svg
+from rig.report.charts import INK, Panel, Point, Series, chart_svg
 from rig.tradeoff.files import colour_of
 from tests.reference.adapter import reconstruct
 from tests.reference.scene import Scene

@@ -11,7 +11,8 @@ from calibration.diagnosis.verdicts import judge_fit
 from calibration.model.rig_model import Identity
 from calibration.rig_fit.fit import fit_rig
 from calibration.verdict import Verdict
-from rig.calibrate.report import measured, page, paragraph, planes_report, subject
+from rig.calibrate.report import measured, planes_report, report_page, subject
+from rig.report.page import paragraph
 from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_views
 
 
@@ -20,7 +21,7 @@ def test_the_report_of_planes_shows_text_first_then_the_four_pictures() -> None:
     fit = fit_rig(views, BOARD, (512, 512))
     judged = judge_fit(fit, views, stated_baseline_m=0.3)
     report, line = planes_report(fit, views, judged), judged.uncertainty.line()
-    html = page(report, judged.verdict, line, [("baseline", "300 mm")])
+    html = report_page(report, judged.verdict, line, [("baseline", "300 mm")])
     text = html[: html.index("<img")]
     assert "PASSED" in text
     assert escape(line) in text
@@ -64,7 +65,7 @@ def test_terms_of_the_model_have_units_and_the_digits_that_are_known() -> None:
 
 
 def test_whatever_users_name_is_escaped() -> None:
-    html = page(("a < b", [("<b>", paragraph("<script>"))]), Verdict(True), "x & y", [("<i>", "1")])
+    html = report_page(("a < b", [("<b>", paragraph("<script>"))]), Verdict(True), "x & y", [("<i>", "1")])
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
     assert "<title>a &lt; b</title>" in html

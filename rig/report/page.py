@@ -1,0 +1,138 @@
+"""The page of all reports: one HTML file with its style, tables, pictures and charts in it, and no reference outside.
+
+A page begins with the verdict in a sentence. It can be read on a phone, where pictures stand one below the other and
+wide tables scroll, and on paper, where no picture or row of a table is cut by the end of a sheet. Numbers have units
+and only the digits that are known.
+"""
+
+import base64
+import re
+from collections.abc import Sequence
+from html import escape
+from typing import Final
+
+import cv2
+import numpy as np
+
+from rig.report.charts import FAINT, INK
+from rig.run_folder.pictures import Picture, png_bytes
+
+_STYLE: Final = f"""
+:root {{ color-scheme: light }}
+* {{ box-sizing: border-box }}
+body {{ font: 15px/1.45 Helvetica, Arial, sans-serif; color: {INK}; background: #fff; max-width: 1060px;
+  margin: 0 auto; padding: 1em 16px 3em; overflow-wrap: break-word }}
+h1 {{ font-size: 1.5em; margin: 0.5em 0 }} h2 {{ font-size: 1.15em; margin: 2em 0 0.4em }} p {{ margin: 0.5em 0 }}
+h3 {{ font-size: 1em; margin: 1em 0 0.2em }}
+.good, .bad {{ padding: 0.6em 1em; margin: 0 0 1em; border-left: 6px solid; background: #f6f8fa }}
+.good {{ border-color: #009e73 }} .bad {{ border-color: #d55e00 }}
+.wide {{ overflow-x: auto; margin: 0.4em 0 }}
+table {{ border-collapse: collapse; font-size: 0.92em }}
+td, th {{ padding: 0.15em 1.1em 0.15em 0; text-align: left; vertical-align: top }}
+tr + tr td {{ border-top: 1px solid #eef1f4 }}
+td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }}
+.side {{ display: flex; flex-wrap: wrap; gap: 4px 20px; align-items: flex-start }}
+figure {{ margin: 0.4em 0; min-width: 0; flex: 1 1 300px; max-width: 586px }}
+figcaption, .small {{ color: #5f6d7b; font-size: 0.88em }}
+img, svg {{ max-width: 100%; height: auto; display: block }}
+.side > svg {{ flex: 1 1 300px; min-width: 0; max-width: 400px }}
+pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 1.35; overflow-x: auto;
+  white-space: pre-wrap; overflow-wrap: anywhere }}
+@media (max-width: 480px) {{ body {{ font-size: 16px; padding: 0.5em 12px 2em }} figure {{ flex-basis: 100% }} }}
+@media print {{
+  body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3 {{ break-after: avoid }}
+  figure, img, svg, tr, .good, .bad {{ break-inside: avoid }} .wide {{ overflow: visible }}
+  .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
+  .side figure {{ flex-basis: 45% }} .side > svg {{ flex-basis: 30% }}
+}}
+"""
+GENERATOR: Final = "spadrig"
+"""Name of the generator in the head of a page, by which a report is recognised."""
+MOST_PX: Final = 512
+"""Longest side of an embedded picture; larger ones are made smaller."""
+JPEG_QUALITY: Final = 82
+"""Quality of embedded photographs, of 0 to 100: finer structures than noise stay."""
+
+_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
+
+Section = tuple[str, str]
+"""A part of a page: its title, and its HTML."""
+Rows = Sequence[tuple[str, str]]
+
+
+def page(title: str, top: Sequence[str], sections: Sequence[Section]) -> str:
+    """The text of the HTML file: the title, pieces of HTML below it, and the sections; those without HTML are left out.
+
+    title, and the titles of sections, are plain text.
+    """
+    shown = escape(title)
+    parts = [
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><meta name="generator" content="{GENERATOR}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{shown}</title><style>{_STYLE}</style></head><body><h1>{shown}</h1>",
+        *top,
+        *(f"<h2>{escape(name)}</h2>\n{body}" for name, body in sections if body),
+        "</body></html>\n",
+    ]
+    return "\n".join(parts)
+
+
+def verdict_box(word: str, line: str, reasons: Sequence[str], *, good: bool) -> str:
+    """The verdict in a box, with its sentence and the reasons for it."""
+    said = f"<p>{escape(line)}</p>" if line else ""
+    why = "".join(f"<p>{escape(reason.rstrip('.'))}.</p>" for reason in reasons)
+    return f'<div class="{"good" if good else "bad"}"><p><b>{escape(word.upper())}</b></p>{said}{why}</div>'
+
+
+def paragraph(text: str, *, small: bool = False) -> str:
+    """A paragraph of plain text."""
+    kind = ' class="small"' if small else ""
+    return f"<p{kind}>{escape(text)}</p>"
+
+
+def preformatted(text: str) -> str:
+    """Plain text with its line breaks, such as a command or a config."""
+    return f"<pre>{escape(text)}</pre>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table. Columns of numbers (or dashes in their place) are aligned right; a wide table scrolls."""
+    numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        kinds = (' class="number"' if number else "" for number in numbers)
+        return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
+
+    top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
+    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
+    return f'<div class="wide"><table>{top}{body}</table></div>'
+
+
+def picture(pixels: Picture, caption: str) -> str:
+    """Embed a picture as PNG, with a caption below it."""
+    return _figure(png_bytes(pixels), "png", caption)
+
+
+def photograph(pixels: Picture, caption: str) -> str:
+    """Embed a grey picture full of noise as JPEG, made smaller if it is larger than `MOST_PX`, with a caption."""
+    share = MOST_PX / max(pixels.shape[:2])
+    if share < 1:
+        pixels = np.asarray(cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), np.uint8)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return _figure(bytes(data), "jpeg", caption)
+
+
+def _figure(data: bytes, kind: str, caption: str) -> str:
+    source = base64.b64encode(data).decode()
+    alt = escape(caption)
+    return f'<figure><img alt="{alt}" src="data:image/{kind};base64,{source}"><figcaption>{alt}</figcaption></figure>'
+
+
+def side_by_side(parts: Sequence[str]) -> str:
+    """Pictures or charts beside each other, as many as fit; on a phone one below the other."""
+    return f'<div class="side">{"".join(parts)}</div>'
+
+
+def every(size: int, most: int = MOST_PX) -> int:
+    """Step of pixels at which a picture with `size` pixels on its longer side has at most `most`."""
+    return -(-size // most)
