@@ -148,6 +148,19 @@ class ReplayRequest(RunRequest):
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AlignRequest:
+    """A look at the laser line at low power, to set a rig up (`rig align`)."""
+
+    power: str | None = option(None, "of the laser, such as '5 mW'", unset="a tenth of its limit")
+    seconds: float | None = option(None, "time after which it ends", unset="until Ctrl-C")
+    scene: str | None = option(None, "a bundled scene, a scene file or a folder (simulated rigs)", unset="the config's")
+    exposures: int | None = option(None, "frames per column (K)", unset="the config's")
+    seed: int = option(0, "seed of everything simulated")
+    arm: bool = option(False, "let a real laser shine: the beam path is clear")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TradeoffRequest:
     """Scans of a simulated rig with all combinations of some settings (`rig tradeoff`)."""
 

@@ -18,6 +18,7 @@ from spadrig.names import require_own_names
 
 require_own_names()  # here too: another package `rig` may have overwritten only `rig/__init__.py`
 
+from rig.api.demo import Demonstration, demonstrate
 from rig.api.quality import quality
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
@@ -25,6 +26,7 @@ from rig.api.scan import plan_scan, reconstruct, replay, scan
 from rig.api.steering import OnMap, SeenMap
 from rig.api.tradeoff import tradeoff
 from rig.bench.soak import soak
+from rig.calibrate.align import align
 from rig.calibrate.camera import calibrate_camera
 from rig.calibrate.check import calibrate_check
 from rig.calibrate.pixels import calibrate_pixels
@@ -41,6 +43,7 @@ from rig.recording.open import info as recording_info
 from rig.recording.repair import repair
 from rig.recording.verify import verify
 from rig.requests import (
+    AlignRequest,
     CameraRequest,
     CheckRequest,
     PixelsRequest,
@@ -60,9 +63,11 @@ from rig.tradeoff.effects import scene_effects as effects
 __all__ = [
     "MAX_SEED",
     "SIMULATED",
+    "AlignRequest",
     "CameraRequest",
     "CheckRequest",
     "Config",
+    "Demonstration",
     "OnMap",
     "PathLike",
     "PixelsRequest",
@@ -76,6 +81,7 @@ __all__ = [
     "SoakRequest",
     "SyncRequest",
     "TradeoffRequest",
+    "align",
     "bench",
     "bundled_rigs",
     "bundled_scenes",
@@ -88,6 +94,7 @@ __all__ = [
     "compress",
     "configure",
     "cut",
+    "demonstrate",
     "devices",
     "doctor",
     "effects",

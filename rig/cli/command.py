@@ -24,6 +24,8 @@ from rig.errors import UsageError
 from rig.requests import options_of
 
 if TYPE_CHECKING:
+    import subprocess
+
     from rig import api as api
     from rig.cli import tables as tables
     from rig.recording.segment import Space
@@ -59,6 +61,7 @@ ConfigArgument = Annotated[
         autocompletion=one_of("config"),
     ),
 ]
+ViewOption = Annotated[bool, typer.Option("--view", help="show it live in the browser, as rig view --live does")]
 _JSON = inspect.Parameter(
     "as_json",
     inspect.Parameter.KEYWORD_ONLY,
@@ -219,8 +222,13 @@ def _parameter(field: "Field[Any]") -> inspect.Parameter:
 
 def _read(field: "Field[Any]", value: Any) -> Any:
     if field.name == "out" and value is None:
-        return Path("runs") / datetime.now().strftime("%Y%m%d-%H%M%S")
+        return dated()
     return _MANY[field.type](_option_name(field), value) if field.type in _MANY else value
+
+
+def dated(prefix: str = "") -> Path:
+    """A folder among the runs that is named after the present time."""
+    return Path("runs") / datetime.now().strftime(f"{prefix}%Y%m%d-%H%M%S")
 
 
 def refused_file(error: BaseException) -> str | None:
@@ -279,6 +287,21 @@ def print_json(content: Mapping[str, Any]) -> None:
     from rig.run_folder.folder import json_text
 
     print(in_options(json_text(content)))
+
+
+def show_page(*, stays: bool = False, required: bool = True) -> "subprocess.Popen[bytes] | None":
+    """Open the live page of this process's runs; None if it cannot be opened, which is said.
+
+    stays: as in `start_page`. required: whether a missing package raises UsageError instead.
+    """
+    from rig.live.page import page_problem, start_page
+
+    problem = page_problem()
+    page = None if problem is not None and not required else start_page(stays=stays)
+    if page is not None and page.poll() is None:
+        return page
+    say(f"warning: no page in the browser{f': {problem}' if problem else ''}; everything else goes on")
+    return None
 
 
 def say_space(space: "Space") -> None:

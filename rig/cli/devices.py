@@ -1,4 +1,4 @@
-"""Commands for devices (`rig doctor`, `devices`, `laser off`), configs (`rig config`) and scenes (`rig scenes`)."""
+"""Commands for devices (`rig doctor`, `align`, `devices`, `laser off`), configs (`rig config`), scenes (`rig scenes`)."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,7 +6,21 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.command import EXIT_DEVICE, Answer, Commands, ConfigArgument, api, in_options, print_json
+from rig.cli.command import (
+    EXIT_ABORTED,
+    EXIT_DEVICE,
+    Answer,
+    Commands,
+    ConfigArgument,
+    api,
+    asks,
+    in_options,
+    print_json,
+    say,
+    show_page,
+)
+from rig.cli.progress import progress
+from rig.requests import AlignRequest
 
 
 def doctor_command(
@@ -19,6 +33,32 @@ def doctor_command(
     lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
     content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
     return Answer(content, lambda: print(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
+
+
+@asks(AlignRequest)
+def align_command(
+    request: AlignRequest,
+    config: ConfigArgument = "simulated",
+    view: Annotated[
+        bool | None, typer.Option("--view/--no-view", help="show it in the browser", show_default="if viser is there")
+    ] = None,
+) -> Answer:
+    """Look at the laser line at low power while setting a rig up: sum image, line width, saturation; until Ctrl-C."""
+    from rig.live.page import page_problem
+
+    if view or (view is None and page_problem() is None):
+        show_page()
+    with progress():
+        found = api.align(config, request, begun=_say_power, tell=lambda figures: say(figures.line))
+    last = found.last
+    code = EXIT_ABORTED if last is None else 0 if found.found else 1
+    note = "no line stands out: check beam, focus and gate, or raise --power or --exposures" if code == 1 else ""
+    said = "aborted before the first sweep was whole" if last is None else last.line
+    return Answer(found.as_json(), lambda: print(said), code, note)
+
+
+def _say_power(power_w: float, limit_w: float) -> None:
+    say(f"laser at {power_w * 1e3:g} mW, {power_w / limit_w:.0%} of its limit; --power sets another. Ctrl-C ends it")
 
 
 def devices_command() -> Answer:
@@ -83,6 +123,7 @@ SCENES: Commands = {
 }
 COMMANDS: Commands = {
     "doctor": doctor_command,
+    "align": align_command,
     "devices": devices_command,
     "laser": ("The laser's safe state.", {"off": laser_off_command}),
 }

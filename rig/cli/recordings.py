@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, api, asks, report, say, say_space, tables
+from rig.cli.command import Answer, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
 from rig.cli.progress import progress
 from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest, RunsRequest
 
@@ -211,8 +211,11 @@ def _show_with_gaps(said: str, gaps: Iterable[tuple[int, int]]) -> None:
 def replay_command(
     request: ReplayRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
+    view: ViewOption = False,
 ) -> Answer:
     """Play a recording as if it were taken now, at any speed."""
+    if view:
+        show_page()
     if request.loop and request.save is None:
         request = replace(request, save="last")
     steps = _step_by_keys if request.clock == "step" else None

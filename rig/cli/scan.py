@@ -1,15 +1,31 @@
-"""Commands that make depth maps, and two on what a scene allows: `rig scan`, `reconstruct`, `effects`, `tradeoff`."""
+"""Commands that make depth maps, and two on what a scene allows: `rig scan`, `reconstruct`, `demo`, `effects`, ..."""
 
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import EXIT_ABORTED, Answer, Commands, ConfigArgument, api, asks, report, say_space, tables
+from rig.cli.command import (
+    EXIT_ABORTED,
+    Answer,
+    Commands,
+    ConfigArgument,
+    ViewOption,
+    api,
+    asks,
+    dated,
+    report,
+    say,
+    say_space,
+    show_page,
+    tables,
+)
 from rig.cli.completion import one_of
 from rig.cli.progress import progress
 from rig.errors import UsageError
+from rig.live.page import end_page
 from rig.requests import ReconstructRequest, ScanRequest, TradeoffRequest, options_of
 
 if TYPE_CHECKING:
@@ -27,6 +43,7 @@ def scan_command(
         Path | None,
         typer.Option("--like", metavar="RUN", help="repeat this run; options given here differ", show_default=False),
     ] = None,
+    view: ViewOption = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
 ) -> Answer:
     """Acquire and reconstruct depth maps."""
@@ -43,6 +60,8 @@ def scan_command(
         estimator: list[str] = []
         plan = api.plan_scan(rig, request, on_space=spaces.append, on_estimator=estimator.append)
         return _of_plan(plan, estimator[0], spaces[0] if spaces else None)
+    if view:
+        show_page()
     with progress():
         result = api.scan(rig, request, on_space=say_space)
     return report(result)
@@ -77,6 +96,29 @@ def reconstruct_command(
     with progress():
         result = api.reconstruct(source, plan, calibration, replace(request, out=out))
     return report(result)
+
+
+def demo_command(
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/demo-DATE-TIME")
+    ] = None,
+    view: Annotated[bool, typer.Option(help="show it in the browser; it stays there until Ctrl-C")] = True,
+) -> int:
+    """Show the program with the simulated rig: a scan, its recording, its replay, and all of it in the browser."""
+    page = show_page(stays=True, required=False) if view else None
+    try:
+        with progress():
+            shown = api.demonstrate(dated("demo-") if out is None else out, tell=say, on_space=say_space)
+        tables.run_table(shown.replayed)
+        print(f"pictures are in {shown.folder / 'replay' / 'depth'}; next: rig view {shown.folder / 'recording'}")
+        if page is not None and page.poll() is None:
+            say("the page stays open; Ctrl-C ends it")
+            with suppress(KeyboardInterrupt):
+                page.wait()
+    finally:
+        if page is not None:
+            end_page(page)
+    return 0 if shown.same else 1
 
 
 def effects_command(
@@ -144,4 +186,5 @@ COMMANDS: Commands = {
     "reconstruct": reconstruct_command,
     "effects": effects_command,
     "tradeoff": tradeoff_command,
+    "demo": demo_command,
 }

@@ -93,9 +93,20 @@ class Feed:
             monitor=_each(self._note_view, others.monitor),
             watched=(lambda: True) if others.monitor is not None else self._watched,
             sweeps=_each(self._note_sweep, others.sweeps),
-            begun=_each(self._note_begun, others.begun),
-            maps=_each(self._note_map, others.maps),
+            begun=_each(self.begin, others.begun),
+            maps=_each(self.show_map, others.maps),
         )
+
+    def begin(self, begun: RunBegun) -> None:
+        """Make the slot of a run, which is about to start. If it cannot be made, that is logged."""
+        self._safely(lambda: self._begin(begun))
+
+    def show_map(self, found: AcquiredMap) -> None:
+        """Publish a map. It must not be changed afterwards."""
+        self._map = found
+        self._map_times.append(time.monotonic())
+        self._gaps += len(found.sweep.gaps)
+        self._doubts |= dict.fromkeys(found.result.doubts)
 
     def show_figures(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Publish the figures of an alignment. The arrays must not be changed afterwards."""
@@ -124,9 +135,6 @@ class Feed:
     def _watched(self) -> bool:
         return self._slot is not None and not self._failed and self._slot.watched
 
-    def _note_begun(self, begun: RunBegun) -> None:
-        self._safely(lambda: self._begin(begun))
-
     def _note_progress(self, now: ScanProgress) -> None:
         self._progress = now
         if self._slot is not None and self._slot.stop_requested and not self._on_main_thread and not self._stopped:
@@ -139,12 +147,6 @@ class Feed:
     def _note_sweep(self, sweep: SweepData) -> None:
         followed = self._watched() and self._slot is not None and self._slot.wanted_row is not None
         self._sweep = sweep if followed else None
-
-    def _note_map(self, found: AcquiredMap) -> None:
-        self._map = found
-        self._map_times.append(time.monotonic())
-        self._gaps += len(found.sweep.gaps)
-        self._doubts |= dict.fromkeys(found.result.doubts)
 
     def _begin(self, begun: RunBegun) -> None:
         self._begun = begun

@@ -1,0 +1,70 @@
+"""Starts the process that shows the runs of this one in the browser: `rig view --live`.
+
+It is a process of its own session, which gets no Ctrl-C that is meant for the run. Nothing of the viewer is imported
+here. It says on stderr where its page is.
+"""
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Final
+
+from drivers.optional_packages import install_command
+from rig.errors import UsageError
+from rig.requests import ViewRequest
+
+READY_S: Final = 20.0
+"""Longest wait for the page: loading what it needs takes some two seconds, on a busy machine more."""
+_LOOK_S = 0.05
+
+
+def page_problem() -> str | None:
+    """The reason why there can be no page here, with the command that mends it; None if there can be one."""
+    if find_spec("viser") is not None:
+        return None
+    return f"the page in the browser needs viser; install it: {install_command('viser')}"
+
+
+def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.Popen[bytes]":
+    """Start the page and wait, READY_S at most, until a browser can open it. If it has ended by then, it said why.
+
+    stays: whether it stays after the run. Otherwise it ends with this process or its run, once no browser shows it.
+    port: None for that of `ViewRequest`. Raises UsageError if there can be no page here.
+    """
+    if (problem := page_problem()) is not None:
+        raise UsageError(problem)
+    port = ViewRequest().port if port is None else port
+    command = [sys.executable, "-m", "spadrig", "view", "--live", "--port", str(port)]
+    process = subprocess.Popen(
+        [*command, *([] if stays else ["--until-closed"])],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    _wait(lambda: process.poll() is not None or _listens(port))
+    return process
+
+
+def end_page(page: "subprocess.Popen[bytes]") -> None:
+    """End a page that stays, also if a browser shows it."""
+    page.terminate()
+    try:
+        page.wait(READY_S)
+    except subprocess.TimeoutExpired:
+        page.kill()
+        page.wait()
+
+
+def _wait(done: Callable[[], bool]) -> None:
+    ends_s = time.monotonic() + READY_S
+    while not done() and time.monotonic() < ends_s:
+        time.sleep(_LOOK_S)
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as end:
+        end.settimeout(_LOOK_S)
+        return end.connect_ex(("127.0.0.1", port)) == 0
