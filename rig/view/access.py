@@ -64,8 +64,8 @@ class Access:
         not belong into an address, or for a host that is none of this computer."""
         if token is not None and (_TOKEN.fullmatch(token) is None or len(token) < FEWEST_TOKEN_CHARACTERS):
             raise UsageError(
-                f"`token` has {len(token)} characters; it needs at least {FEWEST_TOKEN_CHARACTERS}, of letters, digits, "
-                "'-' and '_'; leave it out, and one is made"
+                f"`token` has {len(token)} characters; it needs at least {FEWEST_TOKEN_CHARACTERS}, of letters, "
+                "digits, - and _; leave it out, and one is made"
             )
         if not 0 <= port <= 65535:
             raise UsageError(f"`port` is {port}; it must be 1 to 65535, or 0 for any free one")

@@ -38,7 +38,7 @@ def of_summary(summary: Mapping[str, Any], manifest: Mapping[str, Any]) -> list[
         lost = int(frames.get("lost") or 0)
         figures.append(Figure("frames", f"{_whole(frames.get('received'))} of {_whole(frames.get('expected'))}"))
         gaps = len(manifest.get("gaps") or ())
-        figures.append(Figure("lost", f"{_whole(lost)} in {gaps} gaps", BAD if lost else GOOD))
+        figures.append(_lost(lost, gaps))
     if summary.get("maps") is not None:
         rate = summary.get("map_rate_hz")
         figures.append(Figure("maps", _whole(summary["maps"]) + ("" if rate is None else f", {rate:.3g} a second")))
@@ -82,8 +82,7 @@ def _progress(status: Mapping[str, Any]) -> Iterator[Figure]:
     yield Figure("stage", str(status.get("stage") or "unknown"))
     planned = status.get("frames_planned")
     yield Figure("frames", _whole(status.get("frames")) + (f" of {_whole(planned)}" if planned else ""))
-    lost, gaps = int(status.get("lost") or 0), _number(status.get("gaps"))
-    yield Figure("lost", f"{_whole(lost)} in {gaps} gaps", _bad(lost or gaps))
+    yield _lost(int(status.get("lost") or 0), int(status.get("gaps") or 0))
     rate, planned = status.get("map_rate_hz"), status.get("maps")
     counted = _whole(status.get("sweeps")) + (f" of {_whole(planned)}" if planned else "")
     yield Figure("maps", counted + (f", {rate:.3g} a second" if rate else ""))
@@ -141,12 +140,13 @@ def _doubts(status: Mapping[str, Any]) -> Iterator[Figure]:
     yield from (Figure("doubt", str(reason), BAD) for reason in reasons)
 
 
+def _lost(frames: int, gaps: int) -> Figure:
+    said = f"{_whole(frames)} frames, {gaps} gaps in whole maps" if frames or gaps else "none"
+    return Figure("lost", said, _bad(frames or gaps))
+
+
 def _bad(value: Any) -> str:
     return BAD if value else GOOD
-
-
-def _number(gaps: Any) -> int:
-    return len(gaps) if isinstance(gaps, list | tuple) else int(gaps or 0)
 
 
 def _whole(value: Any) -> str:

@@ -132,10 +132,6 @@ class Pages:
         """Tell all pages the newest value of a topic, and those that come later."""
         self._soon(self._tell, topic, message_bytes(topic, content, picture))
 
-    def forget(self, topic: str) -> None:
-        """Tell no page any more what was last told of a topic."""
-        self._soon(self._newest.pop, topic, None)
-
     def answer(self, page: int, topic: str, content: Mapping[str, Any]) -> None:
         """Tell one page; nothing happens if it is gone."""
         self._soon(self._answer, page, topic, message_bytes(topic, content))

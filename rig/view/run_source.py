@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.files.npy_files import load_arrays
 from drivers.errors import DeviceError
 from drivers.json_text import parse_json
 from drivers.recorded.segments import segment_files
@@ -164,11 +165,11 @@ def read_map(folder: Path, number: int, rays: tuple[Float32, Float32] | None, ab
             u, v = np.full_like(counts, np.nan), np.full_like(counts, np.nan)
             u[known], v[known] = found["x"] / found["z"], found["y"] / found["z"]
             rays = u, v
-    confidence = _array(folder, "confidence", number, depth_m.shape)
-    if confidence is None:  # of a run that kept only those of stripes
-        confidence = np.nan_to_num(at_pixels(arrays, "confidence", depth_m, about.get("min_confidence")))
+    worth = _worth(folder, number, depth_m.shape)
+    if not worth:  # a run that kept only the confidence of stripes
+        worth = {"confidence": np.nan_to_num(at_pixels(arrays, "confidence", depth_m, about.get("min_confidence")))}
     return ShownMap(
-        number, arrays, depth_m, confidence, _array(folder, "depth_sd", number, depth_m.shape), counts,
+        number, arrays, depth_m, worth.get("confidence"), worth.get("depth_sd_m"), counts,
         _bytes(folder, "intensity", number, ".png"), rays, about,
     )  # fmt: skip
 
@@ -186,10 +187,11 @@ def _bytes(folder: Path, kind: str, number: int, suffix: str) -> bytes | None:
     return file.read_bytes() if file.exists() else None
 
 
-def _array(folder: Path, kind: str, number: int, shape: tuple[int, ...]) -> Float32 | None:
-    file = folder / kind / f"{number:06d}.npy"
-    array = load(file) if file.exists() else None
-    return array if array is not None and array.shape == shape else None
+def _worth(folder: Path, number: int, shape: tuple[int, ...]) -> dict[str, Float32]:
+    """Confidence and standard deviation of each pixel's depth; empty if the run did not keep them."""
+    file = folder / "confidence" / f"{number:06d}.npz"
+    arrays = load(file, load_arrays) if file.exists() else {}
+    return {name: array.astype(np.float32) for name, array in arrays.items() if array.shape == shape}
 
 
 def _ply_points(ply: bytes) -> NDArray[np.void] | None:

@@ -231,7 +231,8 @@ def _response(
     here = f"'self' ws://{host}" if host else "'self'"
     policy = (
         "default-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; "
-        f"connect-src {here} blob: data:; frame-ancestors 'self'; form-action 'none'; base-uri 'none'; object-src 'none'"
+        f"connect-src {here} blob: data:; frame-ancestors 'self'; "
+        "form-action 'none'; base-uri 'none'; object-src 'none'"
     )
     headers: Headers = Headers(
         {

@@ -1,4 +1,4 @@
-"""One map as the page shows it: its points with colours, its pictures, and the figures of the pixel under the cursor."""
+"""One map as the page shows it: points with colours, pictures, and the figures of the pixel under the cursor."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,13 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.geometry.windows import evenly_spread
-from rig.run_folder.pictures import cloud, depth_limits, depth_picture, intensity_picture, ply_bytes, png_bytes
+from rig.run_folder.pictures import (
+    CONFIDENCE_SCALE,
+    Scale,
+    cloud,
+    depth_limits,
+    depth_scale,
+    doubt,
+    intensity_picture,
+    ply_bytes,
+    png_bytes,
+)
 from rig.simd import Bools, Float32
 
 COLOURS: Final = ("depth", "confidence", "signal", "counts")
 """Values by which points are coloured."""
 NEAR_PX: Final = 3.0
 """A stripe this close to the cursor is the one that is meant, if it is one of those that make the depth."""
+LEGEND: Final = 16
+"""Colours of the legend."""
 Limits = tuple[float, float]
 
 
@@ -23,8 +35,8 @@ class ShownMap:
     """A map. Arrays of pixels are (rows, width); each may be None if the run does not have it.
 
     number: of the map in its run. depth_m, confidence, depth_sd_m: float32, as in `rig.depth.depth.DepthMap`. counts:
-    summed over the sweep, float32, NaN where unknown. picture_of_counts: the PNG file of them, if there is one. rays: (u, v), NaN
-    where unknown. stripe: arrays (rows, columns) of the stripe table. about: more about the map for the page.
+    summed over the sweep, float32, NaN where unknown. picture_of_counts: the PNG file of them, if there is one. rays:
+    (u, v), NaN where unknown. stripe: arrays (rows, columns) of the stripe table. about: more about the map.
     """
 
     number: int
@@ -97,20 +109,36 @@ def at_pixels(stripe: Mapping[str, Float32], name: str, depth_m: Float32, min_co
     return out
 
 
+class Legend(NamedTuple):
+    """A colour scale. rgb: uint8 (LEGEND, 3), colours from one end to the other. ends: texts at both."""
+
+    rgb: NDArray[np.uint8]
+    ends: tuple[str, str]
+
+    @classmethod
+    def of(cls, scale: Scale) -> "Legend":
+        """The legend of a scale."""
+        if scale.labels:  # from the first label to the last
+            (first, first_text), (last, last_text) = scale.labels[0], scale.labels[-1]
+            return cls(scale.colours(np.geomspace(first, last, LEGEND)), (first_text, last_text))
+        low, high = sorted((scale.bright, scale.dark))
+        return cls(scale.colours(np.linspace(low, high, LEGEND)), (f"{low:.3g}", f"{high:.3g} {scale.unit}".rstrip()))
+
+
 class Points(NamedTuple):
-    """Points of a map. xyz_m: float32 (n, 3). rgb: uint8 (n, 3). of: their number before they were thinned. limits: the
-    values at the ends of the colour scale, None if there are none."""
+    """Points of a map. xyz_m: float32 (n, 3). rgb: uint8 (n, 3). of: their number before they were thinned. legend:
+    None if the map has no values for colours; points are grey then."""
 
     xyz_m: Float32
     rgb: NDArray[np.uint8]
     of: int
-    limits: Limits | None
+    legend: Legend | None
 
 
 def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits: Limits | None) -> Points | None:
     """At most `most` points of a map, spread evenly over its pixels, in colours. None without depth or rays.
 
-    by: one of COLOURS; grey if the map has no such values. limits: of the colours of depth; None: those of the map.
+    by: one of COLOURS. limits: of the colours of depth.
     """
     kept = shown.kept(least_confidence)
     if kept is None or shown.depth_m is None or shown.rays is None:
@@ -120,46 +148,45 @@ def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits:
     chosen = pixels[evenly_spread(len(pixels), most)]
     z = shown.depth_m.reshape(-1)[chosen]
     xyz = np.stack([u.reshape(-1)[chosen] * z, v.reshape(-1)[chosen] * z, z], axis=1).astype(np.float32)
-    colours, limits = _colours(shown, by, chosen, limits)
-    return Points(xyz, colours, len(pixels), limits)
-
-
-def _colours(
-    shown: ShownMap, by: str, chosen: NDArray[np.int64], limits: Limits | None
-) -> tuple[NDArray[np.uint8], Limits | None]:
-    if by == "depth":
-        values = shown.depth_m
-        limits = limits or (None if values is None else depth_limits(values))
-    else:
-        values = {"confidence": shown.confidence, "signal": shown.signal(), "counts": shown.counts}[by]
-        limits = (0.0, 1.0) if by == "confidence" else None
+    values, scale = _scaled(shown, by, limits)
     if values is None:
-        return np.full((len(chosen), 3), 128, np.uint8), None
-    of_points = values.reshape(-1)[chosen].astype(np.float32)
-    if limits is None:
-        known = of_points[np.isfinite(of_points)]
-        low, high = np.percentile(known, [1, 99]) if known.size else (0.0, 1.0)
-        limits = float(low), float(high) if high > low else float(low) + 1.0
-    # The colours of the picture, so that both mean the same.
-    row = depth_picture(of_points[None, :], limits)[0, : len(chosen), ::-1]
-    return np.ascontiguousarray(row), limits
+        return Points(xyz, np.full((len(chosen), 3), 128, np.uint8), len(pixels), None)
+    return Points(xyz, scale.colours(values.reshape(-1)[chosen]), len(pixels), Legend.of(scale))
 
 
-def picture_of(shown: ShownMap, what: str, least_confidence: float, limits: Limits | None) -> bytes | None:
-    """A PNG of 'depth', 'counts' or 'confidence'; None if the map has no such values. Pixels begin at its left edge; a
-    scale may stand right of them."""
+def _scaled(shown: ShownMap, by: str, limits: Limits | None) -> tuple[NDArray[np.floating] | None, Scale]:
+    """Values by which points are coloured, (rows, width), and their scale: that of the picture, if there is one. None
+    if the map has no such values."""
+    if by == "depth":
+        return shown.depth_m, depth_scale(limits)
+    if by == "confidence":
+        return None if shown.confidence is None else doubt(shown.confidence), CONFIDENCE_SCALE
+    values = shown.signal() if by == "signal" else shown.counts
+    known = np.zeros(0) if values is None else values[np.isfinite(values)]
+    low, high = (float(value) for value in np.percentile(known, [1, 99])) if known.size else (0.0, 0.0)
+    unit = "photons per exposure" if by == "signal" else "counts"
+    return values if known.size else None, Scale(max(high, low + 1e-6), low, unit, "inferno")
+
+
+class Drawn(NamedTuple):
+    """A picture. png: the file, each pixel one of the map's. legend: None for grey pictures."""
+
+    png: bytes
+    legend: Legend | None
+
+
+def picture_of(shown: ShownMap, what: str, least_confidence: float, limits: Limits | None) -> Drawn | None:
+    """A picture of 'depth', 'counts' or 'confidence'; None if the map has no such values."""
     if what == "counts":
-        if shown.picture_of_counts is not None or shown.counts is None:
-            return shown.picture_of_counts
-        return png_bytes(intensity_picture(shown.counts.astype(np.uint32)))
+        png = shown.picture_of_counts
+        if png is None and shown.counts is not None:
+            png = png_bytes(intensity_picture(shown.counts.astype(np.uint32)))
+        return None if png is None else Drawn(png, None)
     kept = shown.kept(least_confidence)
-    values = shown.depth_m if what == "depth" else shown.confidence
-    if kept is None or values is None or not np.isfinite(shown.depth_m if shown.depth_m is not None else np.nan).any():
+    values, scale = _scaled(shown, what, limits)
+    if kept is None or values is None or not kept.any():
         return None
-    values = np.where(kept, values, np.float32(np.nan))
-    if what == "depth":
-        return png_bytes(depth_picture(values, limits))
-    return png_bytes(depth_picture(values, (0.0, 1.0), ""))
+    return Drawn(png_bytes(scale.colours(np.where(kept, values, np.nan))), Legend.of(scale))
 
 
 def ply_of(shown: ShownMap, least_confidence: float) -> bytes | None:

@@ -28,7 +28,7 @@ from rig.view.live_source import LiveNews, LiveSource, LiveState
 from rig.view.pages import Pages, Wish
 from rig.view.run_source import RunSource, read_map
 from rig.view.server import ViewServer, listen, require_viser
-from rig.view.shown import COLOURS, Limits, ShownMap, picture_of, ply_of, points, steady_limits
+from rig.view.shown import COLOURS, Legend, Limits, ShownMap, picture_of, ply_of, points, steady_limits
 
 MOST_POINTS: Final = 250_000
 """Most points of an update: 3.75 MB, at 15 bytes a point."""
@@ -111,6 +111,7 @@ class _Shows:
         self.title = ""
         self._shown: ShownMap | None = None
         self._label = ""
+        self._estimated_again = False
         self._colour, self._least = "depth", 0.0
         self._limits: Limits | None = None
         self._answered: dict[int, object] = {}
@@ -137,6 +138,10 @@ class _Shows:
         """Counts of a row of the shown map, if there are any."""
         raise NotImplementedError
 
+    def say(self, text: str) -> None:
+        """Show a sentence on all pages, in the place of the one before."""
+        self.pages.tell("notice", {"text": text})
+
     def tell_map(self) -> None:
         """Tell the pages the shown map: points, pictures and its description."""
         shown = self._shown
@@ -151,7 +156,8 @@ class _Shows:
             "least": self._least,
             "points": 0 if found is None else len(found.xyz_m),
             "of_points": 0 if found is None else found.of,
-            "limits": None if found is None else found.limits,
+            **_legend(None if found is None else found.legend),
+            "again": self._estimated_again,
             "doubts": list(shown.about.get("doubts") or ()),
         }
         if found is None or not len(found.xyz_m):
@@ -166,8 +172,9 @@ class _Shows:
             )  # fmt: skip
         self.pages.tell("map", told)
         for what in _PICTURES:
-            picture = picture_of(shown, what, self._least, self._limits)
-            self.pages.tell(f"picture-{what}", {"there": picture is not None, **_size(shown)}, picture or b"")
+            drawn = picture_of(shown, what, self._least, self._limits)
+            told = {"there": drawn is not None, **_size(shown), **_legend(None if drawn is None else drawn.legend)}
+            self.pages.tell(f"picture-{what}", told, b"" if drawn is None else drawn.png)
 
     def take_common(self, wish: Wish) -> bool:
         """Fulfil a wish that both kinds of pages have; False for another one."""
@@ -192,11 +199,12 @@ class _Shows:
             self._answered[wish.page] = state
             self.pages.answer(wish.page, "row", self._row_answer(wish.values["row"], wish.values["x"]))
 
-    def look_from_camera(self, distance_m: float) -> None:
-        """Begin new pages with the view of the camera, turning about a point at this distance."""
+    def look_from_camera(self, distance_m: float, half_height: float = 0.5) -> None:
+        """Begin new pages with the view of the camera, turning about a point at this distance. half_height: tangent of
+        half the angle that is seen."""
         camera = self.server.viser.initial_camera
-        camera.position, camera.look_at = (0.0, 0.0, -0.15 * distance_m), (0.0, 0.0, distance_m)
-        camera.up = (0.0, -1.0, 0.0)
+        camera.position, camera.look_at = (0.0, 0.0, -0.1 * distance_m), (0.0, 0.0, distance_m)
+        camera.up, camera.fov = (0.0, -1.0, 0.0), 2 * float(np.arctan(half_height))
 
     def _row_answer(self, row: int, x: int) -> dict[str, Any]:
         shown = self._shown
@@ -248,7 +256,7 @@ class _ShowsLive(_Shows):
         wishes, following = self.pages.wishes()
         for wish in wishes:
             if not self.take_common(wish) and wish.ask == "stop" and self._source.stop():
-                self.pages.tell("notice", {"text": "The scan was asked to stop, as by Ctrl-C."})
+                self.say("The scan was asked to stop, as by Ctrl-C.")
         if following:
             self._source.follow(following[-1].values["row"])
         due = time.monotonic() - self._told_s >= 1.0 / self._asked.view_rate
@@ -267,7 +275,7 @@ class _ShowsLive(_Shows):
         if begun and self._source.slot is not None:
             self._fog.clear()
             self._shown, self._limits = None, None
-            self.pages.forget("notice")
+            self.say("")
             self._tell_setup({}, self._source.slot.name)
         if news.setup is not None:
             near_m, far_m = news.setup.get("depth_range_m") or (1.0, 9.0)
@@ -372,11 +380,11 @@ class _ShowsRun(_Shows):
 
     def _select(self, number: int) -> None:
         try:
-            self._shown = self._source.map(number)
+            self._shown, self._estimated_again = self._source.map(number), False
         except (RigError, DeviceError) as error:
-            self.pages.tell("notice", {"text": f"Map {number} cannot be shown: {error}"})
+            self.say(f"Map {number} cannot be shown: {error}")
             return
-        self.pages.forget("notice")
+        self.say("")
         self._label = f"map {number}" if self._shown.stripe else f"counts of map {number}, which has no estimate"
         if not self._source.recorded and not self._shown.stripe:
             self._label = f"sum {number} of imported frames"
@@ -386,7 +394,7 @@ class _ShowsRun(_Shows):
 
     def _begin(self, estimator: str) -> None:
         if self._again is not None or self._shown is None or self._source.rows is None:
-            self.pages.tell("notice", {"text": "An estimate is under way; wait for it."})
+            self.say("An estimate is under way; wait for it.")
             return
         least = self._least or self._source.min_confidence
         cut = self._source.rows.plan.blanking is None
@@ -394,7 +402,7 @@ class _ShowsRun(_Shows):
         try:
             self._again = Estimation(asked)
         except UsageError as error:
-            self.pages.tell("notice", {"text": str(error)})
+            self.say(str(error))
             return
         self.pages.tell("estimate", {"busy": True, "text": f"estimating map {asked.number} with {estimator}"})
 
@@ -404,18 +412,18 @@ class _ShowsRun(_Shows):
         try:
             if made.folder is None:
                 text = f"Map {asked.number} could not be estimated with {asked.estimator}: {made.problem}"
-                self.pages.tell("notice", {"text": text})
+                self.say(text)
             else:
                 rows = self._source.rows
                 rays = None if rows is None or rows.model is None else rows.geometry.rays
                 found = read_map(made.folder, made.number, rays, {"min_confidence": asked.min_confidence})
-                self._shown = replace(found, number=asked.number)
+                self._shown, self._estimated_again = replace(found, number=asked.number), True
                 took_s = float(made.summary.get("compute_time_s") or 0.0)
                 self._label = f"map {asked.number}, estimated again with {asked.estimator} in {took_s:.2g} s"
                 self.tell_map()
                 self._tell_fog(made.summary.get("fog"), asked.number)
         except RigError as error:
-            self.pages.tell("notice", {"text": str(error)})
+            self.say(str(error))
         finally:
             self._again.close()
             self._again = None
@@ -432,6 +440,12 @@ def _pixel_m(shown: ShownMap) -> float:
     assert shown.rays is not None, "it has points"
     step = float(np.nanmedian(np.abs(np.diff(shown.rays[0], axis=1))))
     return 1.2 * float(np.nanmedian(shown.depth_m)) * (step if np.isfinite(step) else 2e-3)
+
+
+def _legend(legend: Legend | None) -> dict[str, Any]:
+    if legend is None:
+        return {"legend": [], "ends": ["", ""]}
+    return {"legend": [f"rgb({r},{g},{b})" for r, g, b in legend.rgb.tolist()], "ends": list(legend.ends)}
 
 
 def _size(shown: ShownMap) -> dict[str, int]:
