@@ -1,4 +1,4 @@
-"""Commands for devices (`rig doctor`, `align`, `devices`, `laser off`), configs (`rig config`), scenes (`rig scenes`)."""
+"""Commands for devices (`rig doctor`, `align`, `devices`, `laser off`), configs (`config`) and scenes (`scenes`)."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +20,7 @@ from rig.cli.command import (
     show_page,
 )
 from rig.cli.progress import progress
+from rig.errors import UsageError
 from rig.requests import AlignRequest
 
 
@@ -46,19 +47,23 @@ def align_command(
     """Look at the laser line at low power while setting a rig up: sum image, line width, saturation; until Ctrl-C."""
     from rig.live.page import page_problem
 
-    if view or (view is None and page_problem() is None):
-        show_page()
+    shown = view or (view is None and page_problem() is None)
+    if shown and (problem := page_problem()) is not None:
+        raise UsageError(problem)
+
+    def begun(power_w: float, limit_w: float) -> None:
+        if shown:
+            show_page()
+        share = f"{power_w * 1e3:g} mW, {power_w / limit_w:.0%} of its limit"
+        say(f"laser at {share}; --power sets another. Ctrl-C ends it")
+
     with progress():
-        found = api.align(config, request, begun=_say_power, tell=lambda figures: say(figures.line))
+        found = api.align(config, request, begun=begun, tell=lambda figures: say(figures.line))
     last = found.last
     code = EXIT_ABORTED if last is None else 0 if found.found else 1
     note = "no line stands out: check beam, focus and gate, or raise --power or --exposures" if code == 1 else ""
     said = "aborted before the first sweep was whole" if last is None else last.line
     return Answer(found.as_json(), lambda: print(said), code, note)
-
-
-def _say_power(power_w: float, limit_w: float) -> None:
-    say(f"laser at {power_w * 1e3:g} mW, {power_w / limit_w:.0%} of its limit; --power sets another. Ctrl-C ends it")
 
 
 def devices_command() -> Answer:
