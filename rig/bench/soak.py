@@ -10,7 +10,7 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -82,6 +82,8 @@ class LoopedSpad(SpadArray):
         self._counters = SpadCounters(0, 0, 0, 0, 0)
         self._run_id = 0
         self._lead = min(LEAD_FRAMES, len(loop.records) // (2 * loop.sweeps))
+        self.started_s = 0.0
+        """Time of the newest start, by `time.perf_counter`."""
         self.late_max_s = 0.0
         """Largest lateness of a block, in s: the source, too, needs its share of the processor."""
 
@@ -108,7 +110,7 @@ class LoopedSpad(SpadArray):
         self._just_lost = False
         self._run_id = (self._run_id + 1) & 0xFFFF
         self._counters = SpadCounters(0, 0, 0, 0, 0)
-        self._start_s = time.perf_counter()
+        self.started_s = time.perf_counter()
 
     def _do_fill(self, ring: BlockRing, timeout_s: float) -> bool:
         first = self._next_frame
@@ -138,7 +140,7 @@ class LoopedSpad(SpadArray):
         return self._counters
 
     def _wait_until_exposed(self, frames: int) -> None:
-        due_s = self._start_s + frames * self._frame_s
+        due_s = self.started_s + frames * self._frame_s
         left_s = due_s - time.perf_counter()
         if left_s > 0:
             time.sleep(left_s)
@@ -279,7 +281,7 @@ def soak(request: SoakRequest | None = None, *, progress: Progress | None = None
         raise UsageError(f"estimator {request.estimator!r} is unknown; choose one of {known}")
     if request.threads is not None and not 1 <= request.threads <= MOST_THREADS:
         raise UsageError(f"{request.threads} threads were asked for; give 1 to {MOST_THREADS}")
-    with _looped_rig(policy, request) as (rig, spad), _quiet_sweeps():
+    with looped_rig(policy, request) as (rig, spad), quiet_sweeps():
         plan, timing = prepare(rig)
         maps = max(2, 1 + math.ceil(seconds / float(plan.sweep_s)))  # the first one is taken alone
         warm_up(request.estimator, "none", plan.exposures, dark=True)
@@ -290,8 +292,8 @@ def soak(request: SoakRequest | None = None, *, progress: Progress | None = None
 
 
 @contextmanager
-def _quiet_sweeps() -> Iterator[None]:
-    """Log no line for a sweep that lost frames: there may be thousands, and the report counts them."""
+def quiet_sweeps() -> Iterator[None]:
+    """A context that logs no line for a sweep that lost frames: there may be thousands, and the report counts them."""
     log = logging.getLogger("rig.count.sweeps")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -302,13 +304,18 @@ def _quiet_sweeps() -> Iterator[None]:
 
 
 @contextmanager
-def _looped_rig(policy: Overload, request: SoakRequest) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD."""
+def looped_rig(
+    policy: Overload, request: SoakRequest, changes: Mapping[str, object] | None = None
+) -> Iterator[tuple[OpenRig, LoopedSpad]]:
+    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD.
+
+    changes: further settings of the config, by their keys."""
     # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {
         "scanner.clock_error": "0 ppm",
         "scan.depth_range": DEPTH_RANGE,
         "scan.exposures": request.exposures,
+        **(changes or {}),
     }
     if request.window:
         settings["spad.link"] = f"{_window_bytes_per_s(settings) / 1e6:.6f} MB/s"
