@@ -138,6 +138,10 @@ class _Shows:
         """Counts of a row of the shown map, if there are any."""
         raise NotImplementedError
 
+    def why_no_counts(self, number: int) -> str:
+        """The reason why `row_counts` has none of this map, for people."""
+        raise NotImplementedError
+
     def say(self, text: str) -> None:
         """Show a sentence on all pages, in the place of the one before."""
         self.pages.tell("notice", {"text": text})
@@ -225,6 +229,8 @@ class _Shows:
             }
             if answer["counts"] is None and 0 <= x < counted.counts.shape[1]:
                 answer["counts"] = int(counted.counts[:, x].sum())
+        elif counted is None:
+            answer["why"] = self.why_no_counts(shown.number)
         return answer
 
     def _download(self) -> tuple[str, bytes] | None:
@@ -246,6 +252,7 @@ class _ShowsLive(_Shows):
         self._fog: list[dict[str, Any]] = []
         self._figures: list[health.Figure] = []
         self._state: LiveState | None = None
+        self._estimator = ""
         self._told_s = -np.inf
         self._parent = os.getppid() if hasattr(os, "getppid") else 0
         self._tell_setup({}, "waiting for a scan")
@@ -270,6 +277,14 @@ class _ShowsLive(_Shows):
     def row_counts(self, number: int, row: int) -> RowCounts | None:
         """Counts of a row of the newest map, if the scan has sent them."""
         return self._source.row(number, row)
+
+    def why_no_counts(self, number: int) -> str:
+        """The reason why the scan has not sent any."""
+        if self._source.state is not LiveState.LIVE:
+            return "the scan is over; the counts of its last map's rows went with it"
+        if self._estimator == "likelihood" and number:
+            return "likelihood judges columns as they come, and keeps no counts of rows after the first map"
+        return "the counts of this row come with the next map"
 
     def _take(self, news: LiveNews, begun: bool) -> None:
         if begun and self._source.slot is not None:
@@ -312,8 +327,7 @@ class _ShowsLive(_Shows):
         self.title = title
         uncalibrated = ((setup.get("config") or {}).get("calibration", "") is None) if setup else False
         notes = ["No depth: the rig is not calibrated (rig calibrate)."] if uncalibrated else []
-        streams = setup.get("estimator") == "likelihood"
-        notes += ["While maps stream, likelihood keeps no counts of rows after the first map."] if streams else []
+        self._estimator = str(setup.get("estimator") or "")
         told = {
             "live": True,
             "kind": setup.get("kind") or "live",
@@ -377,6 +391,10 @@ class _ShowsRun(_Shows):
     def row_counts(self, number: int, row: int) -> RowCounts | None:
         """Counts of a row, from the recording."""
         return self._source.row(number, row)
+
+    def why_no_counts(self, number: int) -> str:
+        """The reason why the run has none."""
+        return "the frames of this map are not recorded" if self._source.recorded else "this run has no recording"
 
     def _select(self, number: int) -> None:
         try:
