@@ -26,9 +26,10 @@ from calibration.rig_fit.fit import RigFit, SweepFit
 from calibration.sync.lag_fit import SyncFit
 from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
+from rig.report.calibration import WIDTH_PX, enlarged_mm, uncertainty_section
 from rig.report.charts import Panel, Series, chart_svg
 from rig.report.page import Rows, Section, page, paragraph, picture, table, verdict_box
-from rig.run_folder.pictures import Picture, Scale, depth_limits
+from rig.run_folder.pictures import Picture, Scale
 
 Report = tuple[str, Sequence[Section]]
 """A report's title and its parts."""
@@ -85,7 +86,6 @@ def subject(identity: Identity | None, board: Board | None, versions: Mapping[st
     return rows
 
 
-_WIDTH_PX = 640
 _GROUND, _RIM, _INK = (255, 255, 255), (189, 194, 200), (51, 64, 77)
 _ERROR = (213, 94, 0)
 """Colour of errors; colours here are RGB."""
@@ -101,16 +101,10 @@ def view_colour(view: int) -> tuple[int, int, int]:
 
 def cells_picture(cells_m: Array) -> Picture:
     """Draw deviations of a board's squares from their plane, (squares down, across): bright in front, black if NaN."""
-    large = _enlarged_mm(cells_m)
+    large = enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
     return Scale(-most, most, "mm", absent="no scan").picture(large)
-
-
-def _enlarged_mm(values_m: Array) -> NDArray[np.float32]:
-    rows, columns = values_m.shape
-    size = (_WIDTH_PX, max(1, round(_WIDTH_PX * rows / columns)))
-    return np.asarray(cv2.resize(values_m * 1e3, size, interpolation=cv2.INTER_NEAREST), np.float32)
 
 
 def _at(x: float, y: float, scale: float) -> tuple[int, int]:
@@ -162,13 +156,13 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
     """Two sections: where corners were seen, with the views' colours and names; and enlarged arrows from there to where
     the model puts the corners. residuals_px: (n, 2) of each view's corners, projected minus seen.
     """
-    scale = _WIDTH_PX / camera.width
-    coverage = np.full((round(camera.height * scale), _WIDTH_PX, 3), _GROUND, np.uint8)
-    cv2.rectangle(coverage, (0, 0), (_WIDTH_PX - 1, coverage.shape[0] - 1), _RIM, 1)
+    scale = WIDTH_PX / camera.width
+    coverage = np.full((round(camera.height * scale), WIDTH_PX, 3), _GROUND, np.uint8)
+    cv2.rectangle(coverage, (0, 0), (WIDTH_PX - 1, coverage.shape[0] - 1), _RIM, 1)
     arrows = coverage.copy()
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals_px if len(residual)] or [np.ones(1)])
     typical = float(np.percentile(lengths, 90)) * scale
-    times = next((factor for factor in ARROW_TIMES if typical * factor < _WIDTH_PX / 25), 1)
+    times = next((factor for factor in ARROW_TIMES if typical * factor < WIDTH_PX / 25), 1)
     for i, (view, residuals) in enumerate(zip(views, residuals_px, strict=True)):
         corners = corners_px(view)
         for (x, y), (dx, dy) in zip(corners, residuals, strict=True):
@@ -183,19 +177,6 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
         ("Coverage", picture(coverage, "Corners of all views, each named at its first corner.")),
         ("Residuals of the corners", picture(arrows, f"Drawn {times} times longer than they are.")),
     ]
-
-
-def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
-    """Section with a picture of the expected depth error: bright where it is large, black where no scan reaches."""
-    if not np.isfinite(uncertainty.sd_m).any():
-        return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
-    caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
-    large = _enlarged_mm(uncertainty.sd_m)
-    low, high = depth_limits(large) or (0.0, 1.0)
-    drawn = Scale(high, low, "mm", "inferno", absent="no scan").picture(large)
-    rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
-    said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
-    return "Expected depth error", picture(drawn, caption) + said
 
 
 def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report:

@@ -28,7 +28,8 @@ Point = tuple[float, float]
 class Series:
     """A curve, or single points. Those that are not finite or that a logarithmic axis cannot show are left out.
 
-    intervals: (low, high) in y of each point. names: small text beside each point.
+    intervals: (low, high) in y of each point. names: small text beside each point. gaps: whether the curve breaks where
+    a point is left out.
     """
 
     label: str
@@ -39,6 +40,7 @@ class Series:
     dashed: bool = False
     line: bool = True
     marker: bool = True
+    gaps: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +152,27 @@ def chart_svg(
     return "\n".join([*parts, "</svg>\n"])
 
 
+def legend(series: Sequence[Series]) -> str:
+    """HTML of a legend of curves, for charts that stand beside each other."""
+    parts = []
+    for each in series:
+        line = Series("", each.colour, ((0, 0), (1, 0)), dashed=each.dashed, line=each.line, marker=each.marker)
+        drawn = _curve(Axis(0, 1, False, 4, 28), Axis(0, 1, False, 7, 6), line)
+        sample = f'<svg class="key" viewBox="0 0 32 14" width="32" height="14">{drawn}</svg>'
+        parts.append(f"<span>{sample} {escape(each.label)}</span>")
+    return f'<p class="legend">{"".join(parts)}</p>'
+
+
+def panel_svg(panel: Panel) -> str:
+    """A single panel as SVG text without a title of its own and without a legend."""
+    width, height = PANEL_PX
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        f'font-family="Helvetica, Arial, sans-serif" font-size="12"><title>{escape(panel.title)}</title>'
+        f"{panel.svg()}</svg>"
+    )
+
+
 def _axes(x: Axis, y: Axis, panel: Panel) -> str:
     right, bottom = x.end_px, y.start_px
     parts = [_text(x.start_px, 18, panel.title, weight="bold")]
@@ -172,9 +195,8 @@ def _curve(x: Axis, y: Axis, series: Series) -> str:
     parts = []
     dashes = ' stroke-dasharray="5 4"' if series.dashed else ""
     if series.line and len(series.points) > 1:
-        parts.append(
-            f'<path d="{_path(x, y, series.points)}" fill="none" stroke="{series.colour}" stroke-width="1.8"{dashes}/>'
-        )
+        path = _path(x, y, series.points, gaps=series.gaps)
+        parts.append(f'<path d="{path}" fill="none" stroke="{series.colour}" stroke-width="1.8"{dashes}/>')
     for (at, _), (low, high) in zip(series.points, series.intervals, strict=False):
         ends = x.px(at), y.px(max(low, y.low)), y.px(high)
         if all(map(math.isfinite, ends)):
@@ -193,10 +215,16 @@ def _curve(x: Axis, y: Axis, series: Series) -> str:
     return "".join(parts)
 
 
-def _path(x: Axis, y: Axis, points: Sequence[Point]) -> str:
-    placed = [(x.px(a), y.px(b)) for a, b in points]
-    shown = [f"{a:.1f} {b:.1f}" for a, b in placed if math.isfinite(a) and math.isfinite(b)]
-    return "M" + "L".join(shown) if shown else ""
+def _path(x: Axis, y: Axis, points: Sequence[Point], *, gaps: bool = False) -> str:
+    """Steps of a path through the points that can be shown; with gaps a new one begins behind each that cannot."""
+    steps, begins = [], True
+    for a, b in ((x.px(point[0]), y.px(point[1])) for point in points):
+        if math.isfinite(a) and math.isfinite(b):
+            steps.append(f"{'M' if begins else 'L'}{a:.1f} {b:.1f}")
+            begins = False
+        elif gaps:
+            begins = True
+    return "".join(steps)
 
 
 def _text(

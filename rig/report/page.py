@@ -9,6 +9,7 @@ import base64
 import re
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import Final
 
 import cv2
@@ -32,32 +33,45 @@ td, th {{ padding: 0.15em 1.1em 0.15em 0; text-align: left; vertical-align: top 
 tr + tr td {{ border-top: 1px solid #eef1f4 }}
 td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }}
 .side {{ display: flex; flex-wrap: wrap; gap: 4px 20px; align-items: flex-start }}
-figure {{ margin: 0.4em 0; min-width: 0; flex: 1 1 300px; max-width: 586px }}
+.pictures {{ display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 4px 20px }}
+figure {{ margin: 0.4em 0; min-width: 0; max-width: 640px }}
 figcaption, .small {{ color: #5f6d7b; font-size: 0.88em }}
 img, svg {{ max-width: 100%; height: auto; display: block }}
+.legend span {{ display: inline-block; margin-right: 1.4em; white-space: nowrap }}
+.key {{ display: inline-block; vertical-align: -2px }}
 .side > svg {{ flex: 1 1 300px; min-width: 0; max-width: 400px }}
 pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 1.35; overflow-x: auto;
   white-space: pre-wrap; overflow-wrap: anywhere }}
-@media (max-width: 480px) {{ body {{ font-size: 16px; padding: 0.5em 12px 2em }} figure {{ flex-basis: 100% }} }}
+@media (max-width: 480px) {{ body {{ font-size: 16px; padding: 0.5em 12px 2em }} .pictures {{ display: block }} }}
 @media print {{
   body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3 {{ break-after: avoid }}
   figure, img, svg, tr, .good, .bad {{ break-inside: avoid }} .wide {{ overflow: visible }}
   .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
-  .side figure {{ flex-basis: 45% }} .side > svg {{ flex-basis: 30% }}
+  .side figure {{ flex-basis: 45% }} .legend span {{ display: inline-block; margin-right: 1.4em; white-space: nowrap }}
+.key {{ display: inline-block; vertical-align: -2px }}
+.side > svg {{ flex-basis: 30% }}
 }}
 """
 GENERATOR: Final = "spadrig"
 """Name of the generator in the head of a page, by which a report is recognised."""
-MOST_PX: Final = 512
-"""Longest side of an embedded picture; larger ones are made smaller."""
+MOST_BYTES: Final = 2_000_000
+"""Largest size of a report."""
+PICTURE_PX: Final = (512, 384, 256, 128)
+"""Longest side of embedded pictures; the smaller ones are for reports that would otherwise be too large."""
 JPEG_QUALITY: Final = 82
 """Quality of embedded photographs, of 0 to 100: finer structures than noise stay."""
 
-_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+)?")
+_NUMBER = re.compile(r"-|[-+]?[\d.]+(e[-+]?\d+)?( of \d+| to [\d.]+)?")
 
 Section = tuple[str, str]
 """A part of a page: its title, and its HTML."""
 Rows = Sequence[tuple[str, str]]
+
+
+def is_report(file: Path) -> bool:
+    """Whether a file is a report that this program wrote. Raises OSError."""
+    with file.open("rb") as stream:
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in stream.read(400)
 
 
 def page(title: str, top: Sequence[str], sections: Sequence[Section]) -> str:
@@ -110,12 +124,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def picture(pixels: Picture, caption: str) -> str:
     """Embed a picture as PNG, with a caption below it."""
-    return _figure(png_bytes(pixels), "png", caption)
+    return _figure(png_bytes(pixels, small=True), "png", caption)
 
 
-def photograph(pixels: Picture, caption: str) -> str:
-    """Embed a grey picture full of noise as JPEG, made smaller if it is larger than `MOST_PX`, with a caption."""
-    share = MOST_PX / max(pixels.shape[:2])
+def photograph(pixels: Picture, caption: str, most_px: int) -> str:
+    """Embed a grey picture full of noise as JPEG, its longer side at most `most_px`, with a caption."""
+    share = most_px / max(pixels.shape[:2])
     if share < 1:
         pixels = np.asarray(cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), np.uint8)
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -128,11 +142,16 @@ def _figure(data: bytes, kind: str, caption: str) -> str:
     return f'<figure><img alt="{alt}" src="data:image/{kind};base64,{source}"><figcaption>{alt}</figcaption></figure>'
 
 
+def pictures(parts: Sequence[str]) -> str:
+    """Pictures in rows of two; on a phone one below the other."""
+    return f'<div class="pictures">{"".join(parts)}</div>'
+
+
+def no_picture(why: str) -> str:
+    """Text in the place of a picture."""
+    return f"<figure><figcaption>{escape(why)}</figcaption></figure>"
+
+
 def side_by_side(parts: Sequence[str]) -> str:
-    """Pictures or charts beside each other, as many as fit; on a phone one below the other."""
+    """Charts or tables beside each other, as many as fit; on a phone one below the other."""
     return f'<div class="side">{"".join(parts)}</div>'
-
-
-def every(size: int, most: int = MOST_PX) -> int:
-    """Step of pixels at which a picture with `size` pixels on its longer side has at most `most`."""
-    return -(-size // most)

@@ -42,7 +42,8 @@ class Scale:
     """Colours of values from `bright` to `dark`, the values at the upper and the lower end of the scale.
 
     unit: written behind the labels. absent: short name of pixels without a value. log: whether the scale is
-    logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values.
+    logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values. steps: number
+    of different colours, of which fewer make a smaller file.
     """
 
     bright: float
@@ -52,6 +53,7 @@ class Scale:
     absent: str = "none"
     log: bool = False
     labels: Sequence[tuple[float, str]] = ()
+    steps: int = 255
 
     def colours(self, values: NDArray[np.floating]) -> Picture:
         """RGB, uint8 (..., 3), of values (...); `NO_VALUE` for NaN. Values beyond an end have that end's colour."""
@@ -59,6 +61,8 @@ class Scale:
 
         values = np.asarray(values, np.float32)
         share = self._share(values)
+        if self.steps < 255:
+            share = np.minimum(np.floor(share * self.steps), self.steps - 1) / np.float32(self.steps - 1)
         # NaN stays NaN in `clip`, and is nothing that a level can be made of.
         levels = np.nan_to_num(np.clip(share, 0, 1, out=share) * np.float32(254) + np.float32(1.5)).astype(np.uint8)
         table = _palette(self.palette)[:, None]
@@ -208,11 +212,15 @@ def beside(left: Picture, right: Picture) -> Picture:
     return np.hstack([left, right])
 
 
-def png_bytes(picture: Picture) -> bytes:
-    """A picture, grey (rows, width) or RGB (rows, width, 3), as a PNG file. Raises ValueError if that fails."""
+def png_bytes(picture: Picture, *, small: bool = False) -> bytes:
+    """A picture, grey (rows, width) or RGB (rows, width, 3), as a PNG file. small: take more time for a smaller file.
+
+    Raises ValueError if that fails.
+    """
     import cv2
 
-    done, data = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 6] if small else []
+    done, data = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1], options)
     if not done:
         raise ValueError(f"a picture of shape {picture.shape} cannot be written as PNG")
     return bytes(data)

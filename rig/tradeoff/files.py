@@ -1,24 +1,31 @@
-"""Writes the files of a trade-off: tradeoff.json, .csv and .svg, and setting.yaml, the setting to use as a config.
+"""Writes the files of a trade-off: tradeoff.json, .csv, .svg, report.html, and setting.yaml, the setting as a config.
 
 The picture shows error over sensor time and over compute time, a pair of panels for each scene and fog.
 """
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import yaml
 
+from calibration.errors import digits
+from drivers.json_text import parse_json
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
+from rig.errors import UsageError
 from rig.report.charts import Panel, Series, chart_svg
+from rig.report.page import page, paragraph, preformatted, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
-from rig.tradeoff.rows import Clock, TradeoffRow
+from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
 from rig.tradeoff.trials import Tradeoff
 
 SETTING_FILE = "setting.yaml"
+TRADEOFF_FILE = "tradeoff.json"
 
 
 def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) -> Tradeoff:
@@ -26,9 +33,11 @@ def write_files(folder: RunFolder, done: Tradeoff, setting: RigConfig | None) ->
 
     setting: config with the chosen setting; None if there is none.
     """
-    folder.write_json("tradeoff.json", {**done.as_json(), "versions": versions()})
+    content = {**done.as_json(), "versions": versions()}
+    folder.write_json(TRADEOFF_FILE, content)
     folder.write_text("tradeoff.csv", csv_text(done.rows))
     folder.write_text("tradeoff.svg", tradeoff_svg(done.rows, done.ci95_by))
+    folder.write_text("report.html", _page(folder.path.name, content, done.rows))
     if setting is not None:
         comments = [f"rig tradeoff: {done.answer}"]
         if done.accepted_calibration:
@@ -50,6 +59,49 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     writer.writeheader()
     writer.writerows(lines)
     return stream.getvalue()
+
+
+def tradeoff_report(folder: Path) -> str:
+    """The text of the HTML file on a trade-off that was written to a folder. Raises UsageError if it cannot be read."""
+    file = folder / TRADEOFF_FILE
+    try:
+        content = parse_json(file.read_bytes())
+        rows = [TradeoffRow(**{**row, "ci95": tuple(row["ci95"])}) for row in content["rows"]]
+        return _page(folder.absolute().name, content, rows)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise UsageError(f"{file} is no trade-off of this version ({reason}); run rig tradeoff again") from error
+
+
+def _page(name: str, content: Mapping[str, Any], rows: Sequence[TradeoffRow]) -> str:
+    """The page: advice, picture, and all rows as a table."""
+    word = str(content["verdict"])
+    box = verdict_box(word, str(content["advice"]), [], good=word == "complete")
+    head = ("place", "setting", "sensor, ms", "compute, ms", "error, px", "95 %", "within 1 px, %", "missing, %",
+            "depth, mm", "best")  # fmt: skip
+    cells = [
+        (
+            _named(row.scene, row.fog), str(TrialSetting(row.estimator, row.filter, row.exposures, row.lines)),
+            digits(row.sensor_ms), digits(row.compute_ms), digits(row.mean_abs_px),
+            f"{digits(row.ci95[0])} to {digits(row.ci95[1])}", f"{100 * row.within_1px:.1f}",
+            f"{100 * row.missing:.1f}", "-" if row.depth_mm is None else digits(row.depth_mm),
+            "; ".join(of for of, best in (("sensor", row.pareto), ("compute", row.pareto_compute)) if best),
+        )
+        for row in rows
+    ]  # fmt: skip
+    note = "Error: mean over all rows and columns with a true stripe; a missing answer counts as 10 px. Best: nothing "
+    note += "else has less error in as little time of the sensor or of the computer."
+    versions = [(name, str(number)) for name, number in (content.get("versions") or {}).items()]
+    return page(
+        f"Trade-off {name}",
+        [box],
+        [
+            ("Error over time", tradeoff_svg(rows, str(content["ci95_by"])) if rows else ""),
+            ("All settings", table(head, cells) + paragraph(note, small=True)),
+            ("Setting to use", preformatted(f"rig scan {SETTING_FILE}") if content.get("answer") else ""),
+            ("Versions", table(("", ""), versions) if versions else ""),
+        ],
+    )
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}

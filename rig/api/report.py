@@ -1,0 +1,112 @@
+"""The call that makes one page of a run, of two runs side by side, of a calibration, or of a trade-off: `report`."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from calibration.errors import CalibrationError
+from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
+from rig.config.overrides import PathLike
+from rig.devices.calibration_use import notes_on
+from rig.errors import UsageError
+from rig.report.calibration import calibration_report
+from rig.report.page import is_report
+from rig.report.run import run_report
+from rig.report.run_facts import is_run, read_run
+from rig.run_folder.folder import replace_file
+from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
+
+_WHAT: Final = "name the folder of a run, a calibration or a trade-off, or a calibration.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class ReportResult:
+    """A report that was written. kind: run, runs, calibration or tradeoff. missing: sentences on what it lacks."""
+
+    file: Path
+    kind: str
+    bytes: int
+    missing: tuple[str, ...] = ()
+
+
+def report(
+    run: PathLike, other: PathLike | None = None, *, out: PathLike | None = None, map: int | None = None
+) -> ReportResult:
+    """Write one HTML page, which needs no other file: of a run or recording, of two of them side by side, of a
+    calibration, or of a trade-off (`rig report`).
+
+    run: its folder; of a calibration also its file. other: a second run. out: the file to write; None: NAME-report.html
+    beside the folder or file. An older report is replaced. map: number of the map that is shown; None: the last one.
+    Whatever is missing in a run is named in the page.
+
+    Raises UsageError for anything else than a run, a calibration or a trade-off, for a map that is not there, and if
+    the file cannot be written.
+    """
+    folder, second = Path(run), None if other is None else Path(other)
+    kind, missing = _kind(folder), ()
+    for what, given in (("`other`", second), ("`map`", map)):
+        if given is not None and kind != "run":
+            raise UsageError(f"{what} is {given}, but {folder} is a {kind}; leave it out, or name a run")
+    if kind == "run":
+        if second is not None and _kind(second) != "run":
+            raise UsageError(f"{second} is no run, so it cannot stand beside {folder}; name the folder of a run")
+        runs = [read_run(each, map) for each in ([folder] if second is None else [folder, second])]
+        kind = "run" if second is None else "runs"
+        text = run_report(runs)
+        missing = tuple(line for each in runs for line in each.missing)
+    elif kind == "calibration":
+        text = _calibration(folder)
+    else:
+        text = tradeoff_report(folder)
+    file = Path(out) if out is not None else _beside(folder, second)
+    _write(file, text)
+    return ReportResult(file, kind, len(text.encode()), missing)
+
+
+def _kind(path: Path) -> str:
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; {_WHAT}")
+    if path.is_dir():
+        if (path / TRADEOFF_FILE).exists():
+            return "tradeoff"
+        if is_run(path):
+            return "run"
+        if (path / CALIBRATION_FILE).exists():
+            return "calibration"
+        raise UsageError(f"{path} holds no run, no calibration and no trade-off; {_WHAT}")
+    if path.suffix in (".yaml", ".yml"):
+        return "calibration"
+    raise UsageError(f"{path} is a file; {_WHAT}")
+
+
+def _calibration(path: Path) -> str:
+    file = path / CALIBRATION_FILE if path.is_dir() else path
+    try:
+        model = load_rig_model(file)
+    except CalibrationError as error:
+        raise UsageError(str(error)) from error
+    more = []
+    if path.is_dir() and (path / "report.html").exists():
+        more.append(f"{path / 'report.html'}   # views, residuals and terms, as the calibration wrote them")
+    more.append(f"rig calibrate check --calibration {file}   # is it still true?")
+    return calibration_report(file, model, notes_on(file, model), datetime.now(UTC), more)
+
+
+def _beside(path: Path, other: Path | None) -> Path:
+    whole = path.absolute()
+    name = whole.stem if whole.is_file() else whole.name
+    second = "" if other is None else f"-and-{other.absolute().name}"
+    return whole.with_name(f"{name}{second}-report.html")
+
+
+def _write(file: Path, text: str) -> None:
+    """Write the page. Only an older report may be replaced."""
+    try:
+        if file.is_dir():
+            raise UsageError(f"`out={file}` is a folder; name a file, such as {file / 'report.html'}")
+        if file.exists() and not is_report(file):
+            raise UsageError(f"`out={file}` exists and is no report; name another file, or remove this one")
+        replace_file(file, text.encode())
+    except OSError as error:
+        raise UsageError(f"cannot write {file}: {error.strerror or error}; name another file as `out`") from error

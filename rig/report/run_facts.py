@@ -1,0 +1,229 @@
+"""Reads what is known of a run for its report. Whatever is missing or damaged is named, and the rest is read."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.files.npy_files import load_array, load_arrays
+from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
+from calibration.model.rig_model import RigModel
+from drivers.errors import DeviceError
+from drivers.json_text import parse_json
+from drivers.recorded.contents import INDEX_FILE
+from rig.errors import RigError, UsageError
+from rig.recording.map_rows import MapRows, RowCounts
+from rig.run_folder.manifest import MANIFEST, read_manifest
+from rig.run_folder.pictures import Picture, intensity_picture
+from rig.run_folder.runs import SUMMARY
+from rig.simd import Float32
+
+ROWS: Final = 5
+"""Number of image rows whose profiles a report shows."""
+Read = TypeVar("Read")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunFacts:
+    """A run as far as it can be read. Arrays of pixels are (rows, width), those of stripes (rows, columns).
+
+    manifest, summary: contents of these files, empty if they are missing. recorded: whether the frames are there.
+    numbers: of the maps that are there. number: of the map that is shown, None without one. depth_m, confidence,
+    depth_sd_m: as in `rig.depth.depth.DepthMap`. stripe: arrays of the stripe table. truth: arrays `x_px`, `depth_m`.
+    counts: the picture of the summed counts. rows: of the picture, whose profiles are shown. counted: counts of these
+    rows in the recording. near_is_left: whether near points lie at smaller x. model: the calibration.
+    missing: a sentence for each thing that a report shows and this run has not.
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    recorded: bool
+    numbers: tuple[int, ...] = ()
+    number: int | None = None
+    depth_m: Float32 | None = None
+    confidence: Float32 | None = None
+    depth_sd_m: Float32 | None = None
+    stripe: Mapping[str, Float32] = field(default_factory=dict)
+    truth: Mapping[str, Float32] = field(default_factory=dict)
+    counts: Picture | None = None
+    rows: tuple[int, ...] = ()
+    counted: Mapping[int, RowCounts] = field(default_factory=dict)
+    near_is_left: bool = True
+    model: RigModel | None = None
+    missing: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.folder.absolute().name
+
+    @property
+    def verdict(self) -> str:
+        """Verdict of the run; 'unknown' if it does not say."""
+        return str(self.summary.get("verdict") or self.manifest.get("verdict") or "unknown")
+
+    @property
+    def taken(self) -> datetime | None:
+        """Date and time of the run; None if it does not say."""
+        return _moment((self.manifest.get("rig") or {}).get("taken"))
+
+    @property
+    def calibration_age(self) -> timedelta | None:
+        """Time from the calibration to the run; None if one of the two is not dated."""
+        made = None if self.model is None or self.model.identity is None else _moment(self.model.identity.created)
+        return None if made is None or self.taken is None else self.taken - made
+
+    @property
+    def ambient(self) -> float:
+        """Ambient light of the last map, in photons per pixel and exposure; 0 if none was measured."""
+        value = (self.summary.get("fog") or {}).get("ambient_per_exposure")
+        return float(value) if isinstance(value, int | float) else 0.0
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run: it has a manifest, a summary beside maps, or frames."""
+    return any((folder / name).exists() for name in (MANIFEST, INDEX_FILE)) or (
+        (folder / SUMMARY).exists() and (folder / "stripe").is_dir()
+    )
+
+
+def read_run(folder: Path, number: int | None = None) -> RunFacts:
+    """Read a run, with one of its maps. number: of the map; None: the last one.
+
+    Raises UsageError if the run has no map of this number.
+    """
+    reader = _Reader(folder)
+    manifest = reader.get(MANIFEST, lambda: read_manifest(folder), "the manifest") or {}
+    summary = reader.get(SUMMARY, lambda: _json(folder / SUMMARY), "the summary") or {}
+    recorded = (folder / INDEX_FILE).exists()
+    numbers = tuple(sorted(int(file.stem) for file in folder.glob("stripe/*.npz") if file.stem.isdigit()))
+    counted = _counted_maps(folder, reader) if recorded else None
+    there = sorted({*numbers, *(counted.maps if counted is not None else ())})
+    if number is not None and number not in there:
+        has = f"it has {there[0]} to {there[-1]}" if there else "it has none"
+        raise UsageError(f"map {number} is not in {folder}; {has}")
+    shown = number if number is not None else (numbers or there or (None,))[-1]
+    facts: dict[str, Any] = {"numbers": tuple(there), "number": shown}
+    if not numbers:
+        reader.missing.append("No map was made" + (": rig reconstruct makes maps of the frames." if recorded else "."))
+    if shown in numbers:
+        facts |= _map_files(reader, f"{shown:06d}", manifest)
+    facts["rows"] = _rows(facts, counted)
+    if counted is not None and shown in counted.maps:
+        facts |= _counts(reader, counted, shown, facts)
+    elif not recorded:
+        reader.missing.append("The frames were not recorded (--record), so rows are shown without their counts.")
+    facts["model"] = reader.get("calibration", lambda: _model(folder, manifest), "the calibration")
+    if facts["model"] is None and (manifest.get("calibration") or {}).get("id"):
+        reader.missing.append("The calibration is neither in the run nor where its config says, or has changed since.")
+    return RunFacts(folder, manifest, summary, recorded, missing=tuple(dict.fromkeys(reader.missing)), **facts)
+
+
+class _Reader:
+    """Reads files, and keeps a sentence for each that is missing or damaged."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.missing: list[str] = []
+
+    def get(self, name: str, read: Callable[[], Read], what: str) -> Read | None:
+        """The result of `read`; None if that is not possible. name: of the file, to be checked."""
+        try:
+            return read()
+        except FileNotFoundError:
+            self.missing.append(f"There is no {name} ({what}).")
+        except (OSError, ValueError, KeyError, RigError, DeviceError, CalibrationError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            self.missing.append(f"{what.capitalize()} cannot be read: {reason.rstrip('.')}.")
+        return None
+
+    def file(self, name: str, read: Callable[[Path], Read], what: str) -> Read | None:
+        """A file of the run."""
+        return self.get(name, lambda: read(self.folder / name), what)
+
+
+def _map_files(reader: _Reader, name: str, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """All that is known of a map."""
+    found: dict[str, Any] = {"stripe": reader.file(f"stripe/{name}.npz", load_arrays, "the stripe table") or {}}
+    if (reader.folder / "depth").is_dir():
+        found["depth_m"] = reader.file(f"depth/{name}.npy", load_array, "the depth map")
+        worth = reader.file(f"confidence/{name}.npz", load_arrays, "confidence and error of each pixel") or {}
+        for key in ("confidence", "depth_sd_m"):
+            if key in worth:
+                found[key] = worth[key].astype(np.float32)
+    else:
+        reader.missing.append("Without a calibration there is no depth.")
+    found["counts"] = reader.file(f"intensity/{name}.png", _grey, "the picture of the counts")
+    if (reader.folder / "truth").is_dir():
+        found["truth"] = reader.file(f"truth/{name}.npz", load_arrays, "the truth") or {}
+    elif ((manifest.get("config") or {}).get("world")) is None:
+        reader.missing.append("No truth is known, as with any real scene, so errors are those that the map states.")
+    else:
+        reader.missing.append("The simulated world's truth was not written.")
+    return found
+
+
+def _rows(found: Mapping[str, Any], counted: MapRows | None) -> tuple[int, ...]:
+    """Rows whose profiles are shown, evenly spread over the picture."""
+    stripe = found.get("stripe") or {}
+    height = len(stripe["x_px"]) if "x_px" in stripe else 0 if counted is None else counted.plan.rows
+    return tuple(dict.fromkeys(int((i + 0.5) * height / ROWS) for i in range(ROWS))) if height else ()
+
+
+def _counted_maps(folder: Path, reader: _Reader) -> MapRows | None:
+    return reader.get("frames", lambda: MapRows(folder), "the recording's frames")
+
+
+def _counts(reader: _Reader, counted: MapRows, number: int, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Counts of the shown rows, and their sum over all frames if the run has no picture of it."""
+
+    def read() -> dict[str, Any]:
+        rows = {row: counted.row(number, row) for row in found["rows"]}
+        extra: dict[str, Any] = {"counted": rows, "near_is_left": counted.geometry.near_is_left}
+        if found.get("counts") is None:
+            extra["counts"] = intensity_picture(counted.summed(number))
+        return extra
+
+    return reader.get("frames", read, "the recording's frames") or {}
+
+
+def _model(folder: Path, manifest: Mapping[str, Any]) -> RigModel | None:
+    """The calibration of a run: its own, or the file that its config names if that is still the same one."""
+    wanted = (manifest.get("calibration") or {}).get("id")
+    own = folder / CALIBRATION_FILE
+    if own.exists():
+        return load_rig_model(own)
+    named = (manifest.get("config") or {}).get("calibration")
+    if wanted is None or not isinstance(named, str) or not Path(named).exists():
+        return None
+    model = load_rig_model(named)
+    return model if model.fingerprint() == wanted else None
+
+
+def _json(file: Path) -> dict[str, Any]:
+    content = parse_json(file.read_bytes())
+    if not isinstance(content, dict):
+        raise ValueError(f"{file.name} is no object")
+    return content
+
+
+def _grey(file: Path) -> NDArray[np.uint8]:
+    picture = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise ValueError(f"{file.name} is no picture")
+    return np.asarray(picture, np.uint8)
+
+
+def _moment(text: object) -> datetime | None:
+    try:
+        moment = datetime.fromisoformat(str(text))
+    except ValueError:
+        return None
+    return moment if moment.tzinfo is not None else None
