@@ -20,6 +20,7 @@ require_own_names()  # here too: another package `rig` may have overwritten only
 
 from rig.api.demo import Demonstration, demonstrate
 from rig.api.quality import quality
+from rig.api.report import ReportResult, report
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
 from rig.api.scan import plan_scan, reconstruct, replay, scan
@@ -74,6 +75,7 @@ __all__ = [
     "PlanesRequest",
     "ReconstructRequest",
     "ReplayRequest",
+    "ReportResult",
     "RunResult",
     "RunsRequest",
     "ScanRequest",
@@ -109,6 +111,7 @@ __all__ = [
     "recording_info",
     "repair",
     "repeat",
+    "report",
     "replay",
     "runs",
     "scan",

@@ -159,6 +159,33 @@ def quality_command(
     return Answer(asdict(found), lambda: tables.quality_table(found))
 
 
+def report_command(
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="RUN", help="folder of a run, calibration or trade-off", show_default=False),
+    ],
+    other: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="a run to stand beside it", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="file to write", show_default="NAME-report.html beside RUN")
+    ] = None,
+    number: Annotated[
+        int | None, typer.Option("--map", help="number of the map to show", show_default="the last one", min=0)
+    ] = None,
+) -> Answer:
+    """Write one HTML page on a run, or on two side by side: verdict, pictures, rows, errors, times, settings."""
+    with progress(compiles=False):
+        made = api.report(run, other, out=out, map=number)
+
+    def show() -> None:
+        for line in made.missing:
+            say(line)
+        print(f"{made.file}: {made.bytes / 1e6:.2f} MB")
+
+    return Answer(asdict(made), show)
+
+
 @asks(ImportRequest)
 def import_command(
     request: ImportRequest,
@@ -247,6 +274,7 @@ def _follow(pace: "Pace", handle: int) -> None:
 
 COMMANDS: Commands = {
     "runs": runs_command,
+    "report": report_command,
     "quality": quality_command,
     "verify": verify_command,
     "repair": repair_command,
