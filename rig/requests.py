@@ -124,6 +124,8 @@ class ScanRequest(RunRequest):
         "file that keeps what the estimator has learned, for the next scan's first map", "the config's, else none"
     )
     seed: int = option(0, "seed of everything simulated")
+    record_on_request: bool = option(False, "record parts of the scan, between 'rig record on' and 'rig record off'")
+    before: str | None = option(None, "how long before 'rig record on' a part begins: '2 s'", unset="0 s")
 
 
 @described

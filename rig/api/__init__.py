@@ -20,6 +20,7 @@ require_own_names()  # here too: another package `rig` may have overwritten only
 
 from rig.api.demo import Demonstration, demonstrate
 from rig.api.quality import quality
+from rig.api.record import RecordState, record
 from rig.api.report import ReportResult, report
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
@@ -57,6 +58,7 @@ from rig.requests import (
     SyncRequest,
     TradeoffRequest,
 )
+from rig.scan.on_request import RecordingSwitch
 from rig.scan.run import RunResult
 from rig.tradeoff.effects import flux_row
 from rig.tradeoff.effects import scene_effects as effects
@@ -74,6 +76,8 @@ __all__ = [
     "PixelsRequest",
     "PlanesRequest",
     "ReconstructRequest",
+    "RecordState",
+    "RecordingSwitch",
     "ReplayRequest",
     "ReportResult",
     "RunResult",
@@ -108,11 +112,12 @@ __all__ = [
     "plan_text",
     "quality",
     "reconstruct",
+    "record",
     "recording_info",
     "repair",
     "repeat",
-    "report",
     "replay",
+    "report",
     "runs",
     "scan",
     "soak",

@@ -10,6 +10,7 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
+from rig.api.record import followed
 from rig.api.steering import OnMap, Steering, note
 from rig.config.estimators import estimator_names, is_estimator
 from rig.config.files import load_cube_plan
@@ -33,6 +34,7 @@ from rig.run_folder.folder import SavePolicy
 from rig.run_folder.runs import label_problems
 from rig.run_folder.summary import MapTally, RunVerdict
 from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
+from rig.scan.on_request import RecordingSwitch
 from rig.scan.pipeline import Overload, require_policy
 from rig.scan.reconstruct import reconstruct_cube
 from rig.scan.replay import play
@@ -49,6 +51,7 @@ def scan(
     monitor: MonitorCallback | None = None,
     on_space: Callable[[Space], None] | None = None,
     on_map: OnMap | None = None,
+    switch: RecordingSwitch | None = None,
     **changes: Any,
 ) -> RunResult:
     """Scan with a rig and return its depth maps (`rig scan`).
@@ -64,6 +67,7 @@ def scan(
       The scan at hand then ends with this map, everything is made safe, and the next one begins in a folder of its own,
       NAME-2 and so on; the result is that of the last, with the others in `earlier`. Settings are checked as a config
       is, so that no power goes beyond the laser's limit. A refused one ends the call with a UsageError in one line.
+    switch: records parts of the scan, between its `on` and its `off`; implies `record_on_request`.
 
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
     frames cannot be written; maps finished by then are in `out`. An interrupt (Ctrl-C) ends the scan; its complete maps
@@ -71,6 +75,8 @@ def scan(
     """
     request = replace(request or ScanRequest(), **changes)
     settings = _configured(config, request)
+    if switch is None and request.record_on_request:
+        switch = RecordingSwitch(request.before or 0.0)
     steering = Steering(on_map, settings, request)
     listeners = replace(_listeners(progress, live, monitor, on_space), enough=steering.enough)
     extra: dict[str, Any] = {}
@@ -79,8 +85,9 @@ def scan(
         rig: OpenRig | None = None
         while True:
             try:
-                with _new_run(settings, request) as run, ExitStack() as own:
+                with _new_run(settings, request, switch) as run, ExitStack() as own:
                     run.extra.update(extra)
+                    own.enter_context(followed(run.path, switch))
                     tap = run.start_tap() if request.record else None
                     if rig is None or tap is not None:  # traffic is recorded from the opening of the devices on
                         stack = own if on_map is None or tap is not None else kept
@@ -196,12 +203,28 @@ def _listeners(
     return Listeners(live=tell, monitor=monitor, on_space=on_space)
 
 
-def _new_run(settings: RigConfig, request: RunRequest) -> Run:
+def _new_run(settings: RigConfig, request: RunRequest, switch: RecordingSwitch | None = None) -> Run:
     """Claim the run's folder. Raises UsageError with all problems of the request, or if it cannot be claimed."""
-    save = _checked(request, light_problems(settings, request.arm))
+    save = _checked(request, [*light_problems(settings, request.arm), *_switch_problems(request, switch)])
     scan, estimate = settings.scan, settings.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
-    return Run(request.out, tally, save, record=request.record)
+    run = Run(request.out, tally, save, record=request.record or switch is not None)
+    run.switch = switch
+    return run
+
+
+def _switch_problems(request: RunRequest, switch: RecordingSwitch | None) -> list[str]:
+    if switch is None:
+        before = getattr(request, "before", None)
+        return [] if before is None else [f"`before` is {before!r}, which is for `record_on_request`; add it"]
+    problems = []
+    if request.record:
+        problems.append("`record` writes all frames, `record_on_request` parts of them; leave one of the two out")
+    if request.out is None:
+        problems.append("a recording on request is written into the run's folder; name one with `out`")
+    if switch.parts:
+        problems.append("this switch has recorded a scan already; make a new one for each")
+    return problems
 
 
 def _checked(request: RunRequest, others: Sequence[str] = ()) -> SavePolicy:

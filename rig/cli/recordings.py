@@ -16,6 +16,7 @@ import typer
 
 from rig.cli.command import Answer, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
 from rig.cli.progress import progress
+from rig.errors import UsageError
 from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest, RunsRequest
 
 if TYPE_CHECKING:
@@ -146,6 +147,25 @@ def runs_command(
     return Answer(content, lambda: tables.runs_table(found))
 
 
+def record_command(
+    wish: Annotated[str, typer.Argument(metavar="on|off|state", help="what to do", show_default=False)],
+    run: Annotated[
+        Path | None,
+        typer.Argument(metavar="[RUN]", help="folder of the scan", show_default="the only one that goes on in runs"),
+    ] = None,
+) -> Answer:
+    """Switch the recording of a scan with --record-on-request on or off, while it goes on."""
+    if wish not in _WISHES:
+        raise UsageError(f"'{wish}' is no wish; write on, off or state")
+    state = api.record(_WISHES[wish], run)
+    doing = "recording" if state.recording else "not recording"
+    said = f"{state.run}: {doing}, {state.parts} part{'' if state.parts == 1 else 's'} so far"
+    return Answer(asdict(state), lambda: print(said))
+
+
+_WISHES = {"on": True, "off": False, "state": None}
+
+
 def quality_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run with depth maps", show_default=False)],
     region: Annotated[
@@ -263,7 +283,8 @@ def _step_by_keys(pace: "Pace") -> None:
 def _follow(pace: "Pace", handle: int) -> None:
     while not pace.closed:
         # Not through sys.stdin: a thread that waits there holds a lock on which the interpreter would hang at exit.
-        if select.select([handle], [], [], _LOOK_S)[0]:
+        # Windows can ask only sockets whether they have something. There the read waits, also behind the replay's end.
+        if sys.platform == "win32" or select.select([handle], [], [], _LOOK_S)[0]:
             data = os.read(handle, 4096)
             for _ in range(data.count(b"\n")):
                 pace.step()
@@ -276,6 +297,7 @@ COMMANDS: Commands = {
     "runs": runs_command,
     "report": report_command,
     "quality": quality_command,
+    "record": record_command,
     "verify": verify_command,
     "repair": repair_command,
     "info": info_command,

@@ -18,11 +18,11 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from drivers.frames import FrameBlock
 from drivers.recorded.contents import HEADER_BYTES, INDEX_FILE, RECORD_BYTES, index_header, index_of, segment_name
-from drivers.ring import RingReader
+from drivers.ring import BlockRing, RingReader
 from drivers.spb1 import BlockLayout
 from rig.errors import RecordingError
 from rig.recording.segment import OpenSegment, Staging, paged
@@ -70,6 +70,7 @@ class Recording:
         on_sync: Callable[[], None] | None = None,
     ) -> None:
         self.folder = folder
+        self.keep_blocks = 0
         self.blocks = 0
         """Number of blocks that count."""
         self.bytes = 0
@@ -101,6 +102,8 @@ class Recording:
             self._index.write(index_header())
             sync_folder(folder)
         except OSError as error:
+            if index := getattr(self, "_index", None):
+                index.close()  # Windows removes no open file
             self._reserve.unlink(missing_ok=True)
             raise self._failed(error) from error
         self._pool = ThreadPoolExecutor(WRITERS, "recording writer")
@@ -137,6 +140,24 @@ class Recording:
         with self._lock:
             self._order.append(placed)
         return self._pool.submit(self._write, block, placed, offset)
+
+    def holds(self, ring: BlockRing) -> int:
+        """Blocks of the ring that are written at a time."""
+        return max(1, min(WRITERS, ring.slots // 4))
+
+    def write_from(self, reader: RingReader) -> None:
+        """Write all blocks of one start of the SPAD; returns once the last one counts. Raises RecordingError."""
+        under_way: deque[Future[None]] = deque()
+        try:
+            while (block := next_block(reader)) is not None:
+                under_way.append(self.submit(block))
+                while len(under_way) >= reader.holds:  # `next` gives the oldest slot back
+                    under_way.popleft().result()
+            while under_way:
+                under_way.popleft().result()
+        finally:
+            for each in under_way:
+                each.exception()  # slots go back only once nobody reads them
 
     def close(self) -> None:
         """Wait until everything is written, end the files and sync them. Raises RecordingError if that fails.
@@ -267,6 +288,42 @@ class Recording:
         )
 
 
+class WritesBlocks(Protocol):
+    """A recording, as far as the pipeline of a scan uses it."""
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks that count."""
+        ...
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that these blocks take."""
+        ...
+
+    @property
+    def busy_s(self) -> float:
+        """Time for checksums and writing, summed over the writers."""
+        ...
+
+    @property
+    def keep_blocks(self) -> int:
+        """Blocks that are held in the ring although they are written or not to be written."""
+        ...
+
+    def begin(self, sweeps: int) -> None:
+        """Begin a start of the SPAD that is to give `sweeps` sweeps."""
+        ...
+
+    def holds(self, ring: BlockRing) -> int:
+        """Blocks of the ring that `write_from` keeps at a time."""
+        ...
+
+    def write_from(self, reader: RingReader) -> None:
+        """Take all blocks of one start of the SPAD. Raises RecordingError."""
+        ...
+
+
 def _reason(error: BaseException) -> str:
     return getattr(error, "strerror", None) or str(error)
 
@@ -274,10 +331,10 @@ def _reason(error: BaseException) -> str:
 class Recorder:
     """Records the blocks of one start of the SPAD. `thread` ends once the last one is written.
 
-    reader: holds as many blocks as may be written at a time. on_failure: called on `thread` when `error` is set.
+    reader: holds as many blocks as `recording.holds` says. on_failure: called on `thread` when `error` is set.
     """
 
-    def __init__(self, reader: RingReader, recording: Recording, on_failure: Callable[[], None]) -> None:
+    def __init__(self, reader: RingReader, recording: WritesBlocks, on_failure: Callable[[], None]) -> None:
         self._reader = reader
         self._recording = recording
         self._on_failure = on_failure
@@ -286,23 +343,16 @@ class Recorder:
 
     def _run(self) -> None:
         with self._reader:
-            under_way: deque[Future[None]] = deque()
             try:
-                while (block := self._next()) is not None:
-                    under_way.append(self._recording.submit(block))
-                    while len(under_way) >= self._reader.holds:  # `next` gives the oldest slot back
-                        under_way.popleft().result()
-                while under_way:
-                    under_way.popleft().result()
+                self._recording.write_from(self._reader)
             except BaseException as error:  # raised again on the caller's thread
                 self.error = error
-                for each in under_way:
-                    each.exception()  # slots go back only once nobody reads them
                 self._on_failure()
 
-    def _next(self) -> FrameBlock | None:
-        """The next block; None after the last one, or after an error of the source (the counting thread reports it)."""
-        try:
-            return self._reader.next()
-        except Exception:
-            return None
+
+def next_block(reader: RingReader) -> FrameBlock | None:
+    """The next block; None after the last one, or after an error of the source (the counting thread reports it)."""
+    try:
+        return reader.next()
+    except Exception:
+        return None

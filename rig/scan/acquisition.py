@@ -28,7 +28,7 @@ from rig.errors import DevicesError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import ScanPlan
 from rig.recording.replay import RecordedStart
-from rig.recording.writer import Recording
+from rig.recording.writer import WritesBlocks
 from rig.run_folder.summary import PipelineStats
 from rig.run_folder.time_of_day import TimeOfDay
 from rig.scan.counting import AcquiredMap, CountingRequest
@@ -67,7 +67,7 @@ class AcquisitionRequest:
     learns: bool = False
     starts: Iterator[RecordedStart] | None = None
     silence_s: float = SILENCE_S
-    recording: Recording | None = None
+    recording: WritesBlocks | None = None
     times: TimeOfDay | None = None
     listeners: Listeners = NOBODY
 
@@ -164,7 +164,8 @@ class Acquisition:
         rig.sync.program(*sync_program(plan, sweeps))
         asked = self._asked
         keeps_time = isinstance(rig.spad, ReplaySpad) and rig.spad.pace.speed is not None
-        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time)
+        held = 0 if asked.recording is None else asked.recording.keep_blocks
+        ring = ring_for(asked.policy, rig.spad.info, plan, self._timing, keeps_time=keeps_time, held=held)
         work = CountingRequest(assembler, sweeps, self._maker, asked.silence_s, self._listeners.sweeps)
         on_frame = None if rig.guard is None else rig.guard.beat
         told = self._listeners

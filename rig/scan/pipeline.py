@@ -16,7 +16,7 @@ from drivers.ring import BlockRing, OnFull
 from rig.count.sweeps import MOST_UNDER_WAY
 from rig.errors import RecordingError, UsageError
 from rig.plan.scan_plan import ScanPlan
-from rig.recording.writer import WRITERS, Recorder, Recording
+from rig.recording.writer import Recorder, WritesBlocks
 from rig.run_folder.summary import PipelineStats
 from rig.run_folder.time_of_day import StartTimes
 from rig.scan.counting import CountingRequest, CountingThread, MapQueue
@@ -46,7 +46,7 @@ class Pipeline:
         spad: SpadArray,
         ring: BlockRing,
         work: CountingRequest,
-        recording: Recording | None = None,
+        recording: WritesBlocks | None = None,
         monitor: MonitorCallback | None = None,
         on_frame: Callable[[int], None] | None = None,
         watched: Callable[[], bool] | None = None,
@@ -60,7 +60,7 @@ class Pipeline:
         self._recording = recording
         self._recorder: Recorder | None = None
         if recording is not None:
-            reader = ring.reader("recorder", holds=max(1, min(WRITERS, ring.slots // 4)))
+            reader = ring.reader("recorder", holds=recording.holds(ring))
             self._recorder = Recorder(reader, recording, self.maps.end_stream)
         self._monitor: Monitor | None = None
         if monitor is not None:
@@ -184,15 +184,16 @@ def require_policy(policy: Overload, info: SpadInfo) -> None:
 
 
 def ring_for(
-    policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False
+    policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False, held: int = 0
 ) -> BlockRing:
     """Allocate the ring between this SPAD and its readers and touch its memory.
 
     keeps_time: whether a SPAD that can wait gets a large ring, so that it rarely has to, as in a replay with a clock.
+    held: further slots, for blocks that a recording holds.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)
     waits = OnFull.WAIT if info.can_wait else OnFull.FAIL
     on_full = OnFull.DROP if policy is Overload.DROP else waits
     frames = slots * (timing.stride // plan.frame_bytes)
-    return BlockRing(slots, timing.stride, on_full=on_full, holds_s=frames / float(plan.frame_rate_hz))
+    return BlockRing(slots + held, timing.stride, on_full=on_full, holds_s=frames / float(plan.frame_rate_hz))

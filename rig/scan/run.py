@@ -28,6 +28,7 @@ from rig.run_folder.folder import Rays, RunFolder, SavePolicy
 from rig.run_folder.manifest import UNFINISHED, file_crc32
 from rig.run_folder.summary import MapTally, RunFrames, RunVerdict, Summary, Synchronisation
 from rig.scan.control_check import ControlCheck
+from rig.scan.on_request import PartsRecording, RecordingSwitch
 
 OutFolder = str | os.PathLike[str] | None
 
@@ -71,13 +72,14 @@ class Run:
     ) -> None:
         """Claim the folder. Raises UsageError if it cannot be written."""
         self.tally = tally
+        self.switch: RecordingSwitch | None = None
         self.extra: dict[str, Any] = {}
         """Further keys of the manifest."""
         self._folder = None if out is None else RunFolder(out, in_place=record)
         self.rays: Rays | None = None
         self.save = save or SavePolicy()
         self._last: tuple[int, MapResult, SweepTruth | None] | None = None
-        self._recording: Recording | None = None
+        self._recording: Recording | PartsRecording | None = None
         self._inputs: dict[str, int] = {}
         self._tap: TapFile | None = None
 
@@ -117,11 +119,12 @@ class Run:
         space.require()
 
         def begun() -> None:
-            assert self._recording is not None, "tells of its starts only"
+            assert recording is not None, "tells of its starts only"
             content = {"versions": versions(), **manifest(), "inputs": self._inputs, "verdict": UNFINISHED}
-            content["recording"] = self._recording.content()
+            content["recording"] = recording.content()
             folder.write_json("manifest.json", content)
 
+        recording: Recording | None = None
         try:
             write_inputs(folder.path)
             self._inputs = {
@@ -133,9 +136,29 @@ class Run:
             raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another `out`") from error
         sync = None if self._tap is None else self._tap.sync
         expected = space.recording_bytes
-        self._recording = Recording(folder.path, expected_bytes=expected, on_begin=begun, on_sync=sync)
+        self._recording = recording = Recording(folder.path, expected_bytes=expected, on_begin=begun, on_sync=sync)
         begun()
-        return self._recording
+        return recording
+
+    def record_on_request(
+        self,
+        keep_blocks: int,
+        held_bytes: int,
+        manifest: Callable[[], Mapping[str, Any]],
+        write_inputs: Callable[[Path], None],
+    ) -> PartsRecording:
+        """Begin a recording in parts, by the run's `switch`; it is closed with the run. The arguments and errors are
+        those of `PartsRecording`."""
+        assert self._folder is not None, "asked for with a folder"
+        assert self.switch is not None, "asked for with a switch"
+
+        def known() -> Mapping[str, Any]:
+            return {"versions": versions(), **manifest()}
+
+        parts = PartsRecording(self._folder.path, self.switch, keep_blocks, held_bytes, known, write_inputs)
+        self._recording = parts
+        self._folder.write_json("manifest.json", {**known(), "verdict": UNFINISHED})
+        return parts
 
     def __enter__(self) -> Self:
         """The run itself."""
@@ -189,7 +212,11 @@ class Run:
             content = {"versions": versions(), **manifest, "verdict": summary.verdict.value}
             if self._recording is not None:
                 self._recording.close()
+            if isinstance(self._recording, Recording):
                 content |= {"inputs": self._inputs, "recording": self._recording.content()}
+            elif self._recording is not None:
+                content["on_request"] = self._recording.content()
+                self._recording.finish(content)
             self._folder.write_json("manifest.json", content)
             self._folder.write_json("summary.json", summary.as_json())
             folder = self._folder.publish()

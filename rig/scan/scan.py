@@ -29,7 +29,7 @@ from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
 from rig.devices.open import OpenRig
 from rig.devices.prepare import lead_s, most_sweeps, prepare, spare_lead_s
-from rig.errors import DevicesError, RigError
+from rig.errors import DevicesError, RigError, UsageError
 from rig.estimate.registry import LEARNING, Learned
 from rig.geometry.windows import SweepGeometry
 from rig.plan.compile import spad_request
@@ -39,6 +39,7 @@ from rig.progress import tell_stage
 from rig.recording.inputs import to_plain, write_inputs
 from rig.recording.replay import RecordedStart, ReplayFacts
 from rig.recording.segment import Space, paged
+from rig.recording.writer import WritesBlocks
 from rig.requests import RunRequest, request_content
 from rig.run_folder.folder import SavePolicy, write_learned
 from rig.run_folder.time_of_day import TimeOfDay, run_time
@@ -121,13 +122,18 @@ def run_scan(
     def write_beside(folder: Path) -> None:
         write_inputs(folder, plan, rig.model, kept)
 
-    recording = None
+    recording: WritesBlocks | None = None
     if request.record:
         assert run.path is not None, "a recording is asked for with a folder"
         space = recording_space(rig, plan, timing, facts, run.path, run.save)
         recording = run.start_recording(lambda: manifest | time_content(), write_beside, space)
         if listeners.on_space is not None:
             listeners.on_space(space)
+    elif run.switch is not None:
+        require_markers(plan)
+        recording = run.record_on_request(
+            *_held(rig, plan, timing, run.switch.before_s), lambda: manifest | time_content(), write_beside
+        )
     asked = AcquisitionRequest(
         maps=facts.maps,
         policy=policy,
@@ -268,6 +274,23 @@ def recording_space(
     map_bytes = BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
     frames_bytes = (math.ceil(frames / block_frames) + starts) * block_bytes
     return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(facts.maps))
+
+
+def _held(rig: OpenRig, plan: ScanPlan, timing: SpadTiming, before_s: float) -> tuple[int, int]:
+    """Blocks that a recording on request holds, for `before_s` and one sweep, and the bytes that they take."""
+    block_frames = spad_request(rig.config.scan, plan).block_frames
+    frames = before_s * float(plan.frame_rate_hz) + float(plan.frames_per_sweep)
+    blocks = math.ceil(frames / block_frames) + 2
+    return blocks, blocks * timing.stride
+
+
+def require_markers(plan: ScanPlan) -> None:
+    """Raise UsageError if a plan has no scan markers: parts of a recording would not know where sweeps begin."""
+    if plan.blanking is not None:
+        raise UsageError(
+            "this SPAD has no scan markers, so a part of its frames cannot be made into maps; record the whole scan "
+            "with `record`"
+        )
 
 
 def foreseen(rig: OpenRig, plan: ScanPlan, maps: int | None) -> str:

@@ -1,0 +1,127 @@
+"""Switching the recording of a scan from another process: two small files in the folder of the run.
+
+`record.state` is locked by the scan as long as it goes on, and says what the recording does. `record.wish` is written
+by `record`; a thread of the scan looks for it fifty times a second. A wish that comes to nothing does no harm.
+"""
+
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.json_text import parse_json
+from rig.config.overrides import PathLike
+from rig.errors import UsageError
+from rig.run_folder.folder import hold, is_held, replace_file
+from rig.scan.on_request import RecordingSwitch
+
+STATE: Final = "record.state"
+WISH: Final = "record.wish"
+LOOK_S: Final = 0.02
+ANSWER_S: Final = 5.0
+"""Longest wait for a scan to do what was asked: its SPAD may be silent meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordState:
+    """The recording of a scan that goes on.
+
+    on: whether it is switched on. recording: whether blocks are being written. parts: number of parts so far.
+    """
+
+    run: Path
+    on: bool
+    recording: bool
+    parts: int
+
+
+@contextmanager
+def followed(folder: Path | None, switch: RecordingSwitch | None) -> Iterator[None]:
+    """A context in which `record` can switch the recording of the run in this folder. Does nothing without a switch."""
+    if folder is None or switch is None:
+        yield
+        return
+    over = threading.Event()
+    state = (folder / STATE).open("wb", buffering=0)
+    hold(state.fileno())
+    thread = threading.Thread(target=_follow, args=(folder, switch, state, over), name="record switch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        state.close()
+        for name in (STATE, WISH):
+            with suppress(OSError):
+                (folder / name).unlink(missing_ok=True)
+
+
+def record(on: bool | None, run: PathLike | None = None, *, runs: PathLike = "runs") -> RecordState:
+    """Switch the recording of a scan on or off that was begun with `record_on_request`, or ask for its state
+    (`rig record`).
+
+    on: None only asks. run: folder of the scan; None: the only one that goes on in the folder `runs`.
+    Returns once the scan has begun or ended its part; the part ends with the sweep under way. Raises UsageError if
+    there is no such scan, or several, or it does not answer within five seconds.
+    """
+    folder = _only_one(Path(runs)) if run is None else Path(run)
+    _require_running(folder)
+    if on is None:
+        return _state(folder)
+    before = _state(folder)
+    replace_file(folder / WISH, json.dumps({"on": on, "id": os.urandom(8).hex()}).encode())
+    ends = time.monotonic() + ANSWER_S
+    while time.monotonic() < ends:
+        time.sleep(LOOK_S)
+        now = _state(folder)
+        if now.on == on and (now.recording == on or now.parts > before.parts or not is_held(folder / STATE)):
+            return now
+    raise UsageError(
+        f"{folder} did not begin or end its part within {ANSWER_S:g} s, but may do so yet; do its frames come? "
+        "'rig record state' tells"
+    )
+
+
+def _follow(folder: Path, switch: RecordingSwitch, state: Any, over: threading.Event) -> None:
+    told: object = None
+    seen = ""
+    while not over.wait(LOOK_S):
+        with suppress(OSError, ValueError):
+            wish = parse_json((folder / WISH).read_bytes())
+            if isinstance(wish, dict) and wish.get("id") != seen:
+                seen = str(wish.get("id"))
+                switch.on() if wish.get("on") is True else switch.off()
+        now = {"on": switch.wanted, "recording": switch.recording, "parts": len(switch.parts)}
+        if now != told:
+            with suppress(OSError):  # a full disk: the recording itself tells of it
+                state.seek(0)
+                state.write(json.dumps(now).encode().ljust(80))
+            told = now
+
+
+def _state(folder: Path) -> RecordState:
+    try:
+        content = parse_json((folder / STATE).read_bytes())
+        return RecordState(folder, bool(content["on"]), bool(content["recording"]), int(content["parts"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return RecordState(folder, False, False, 0)
+
+
+def _require_running(folder: Path) -> None:
+    if not is_held(folder / STATE):
+        what = "is no scan that goes on with `record_on_request`" if folder.is_dir() else "does not exist"
+        raise UsageError(f"{folder} {what}; name the folder of one")
+
+
+def _only_one(runs: Path) -> Path:
+    going = sorted(file.parent for file in runs.glob(f"*/{STATE}") if is_held(file))
+    if len(going) == 1:
+        return going[0]
+    found = f"{len(going)} go on in {runs}: {', '.join(map(str, going))}" if going else f"none goes on in {runs}"
+    raise UsageError(f"of scans with `record_on_request`, {found}; name the folder of one")
