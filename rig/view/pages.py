@@ -29,6 +29,7 @@ MESSAGES_PER_S: Final = 40.0
 BURST: Final = 120.0
 """Messages that a page may send at once, before it is held to `MESSAGES_PER_S`."""
 _MOST_WISHES: Final = 256
+_LARGEST: Final = 1e9
 _POLICY: Final = 1008
 """Close code of a web socket whose messages are not welcome (RFC 6455, 7.4.1)."""
 
@@ -71,7 +72,8 @@ class Wish:
 def _value(value: Any, kind: type) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if not isinstance(value, kind) or isinstance(value, bool) or (kind is not str and not abs(value) < 1e9):
+    too_large = isinstance(value, int | float) and not abs(value) < _LARGEST
+    if not isinstance(value, kind) or isinstance(value, bool) or too_large:
         raise ValueError(f"{value!r} is no {kind.__name__}")
     return value
 
