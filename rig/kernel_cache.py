@@ -102,9 +102,14 @@ def _made_of(files: dict[str, Path]) -> dict[str, str]:
 
 
 def _imported(source: bytes) -> set[str]:
-    """Names that may be modules: `a.b` and `a.b.c` of `from a.b import c`. Relative imports are left out."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
+    """Names that may be modules: `a.b` and `a.b.c` of `from a.b import c`. Relative imports are left out. Source that
+    is just being edited, with an error of syntax, counts as without imports."""
+    found: set[str] = set()
+    try:
+        tree = ast.parse(source)
+    except SyntaxError:
+        return found
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -11,7 +11,8 @@ has ended, was stopped or hangs, the guard switches the light off (within 100 ms
 sleep), and kills an application that does not make its rig safe by itself. `GuardLimits` says what counts as hanging.
 """
 
+from drivers.guard.channel import require_linux
 from drivers.guard.client import Guard
 from drivers.guard.watch import GuardLimits
 
-__all__ = ["Guard", "GuardLimits"]
+__all__ = ["Guard", "GuardLimits", "require_linux"]

@@ -111,6 +111,16 @@ _FRAME, _WAITED = struct.Struct("<q"), struct.Struct("<d")
 _NO_FRAME = -1
 
 
+def require_linux() -> None:
+    """Raise `DeviceError` where no guard can run: it needs memory that two processes share without a file, and /proc,
+    by which it sees whether the application still runs. Only Linux has both."""
+    if not hasattr(os, "memfd_create") or not os.path.exists("/proc/self/stat"):
+        raise DeviceError(
+            "light is guarded by a process that takes it away if the program dies or hangs, which needs Linux; use a "
+            "simulated laser and sync source here, or scan from a Linux PC"
+        )
+
+
 class Heartbeat:
     """The shared page of memory. Each of the two processes has an object of this class for it."""
 
@@ -122,8 +132,7 @@ class Heartbeat:
     @classmethod
     def create(cls) -> "Heartbeat":
         """A new page in memory, not in a file on a disk, which could block. Raises `DeviceError` outside Linux."""
-        if not hasattr(os, "memfd_create"):
-            raise DeviceError("the laser guard needs Linux; scan from a Linux machine")
+        require_linux()
         handle = os.memfd_create("spadrig-heartbeat")
         os.ftruncate(handle, mmap.PAGESIZE)
         beat = cls(handle)

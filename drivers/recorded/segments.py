@@ -14,6 +14,7 @@ import mmap
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -180,6 +181,15 @@ class PlainSegment:
             begin = offset - offset % mmap.PAGESIZE
             self._map.madvise(mmap.MADV_WILLNEED, begin, min(length + offset - begin, self.size - begin))
 
+    def release(self) -> None:
+        """Unmap the file, since Windows neither removes nor renames a mapped one. The segment is of no use then. If
+        something still refers to its bytes, it stays mapped."""
+        self._bytes = np.empty(0, np.uint8)
+        with suppress(BufferError):
+            if self._map is not None:
+                self._map.close()
+        self._map = None
+
 
 class PackedSegment:
     """A segment that was compressed after the run, block by block."""
@@ -215,6 +225,10 @@ class PackedSegment:
         for frame in self._table.frames_at(offset, offset + 1):
             begin, end, _, _ = self._table.places(frame)
             self._file.expect(begin, end - begin)
+
+    def release(self) -> None:
+        """Unmap the file, as `PlainSegment.release` does."""
+        self._file.release()
 
     def _unpacked(self, frame: int) -> Bytes:
         begin, end, start, stop = self._table.places(frame)

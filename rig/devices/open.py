@@ -13,7 +13,7 @@ from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.clock import Clock, SystemClock, VirtualClock
 from drivers.errors import DeviceError, DeviceTimeout, NoAnswer, ProtocolError
-from drivers.guard import Guard
+from drivers.guard import Guard, require_linux
 from drivers.interfaces import BeamScanner, LineLaser, SpadArray, SyncSource, World
 from drivers.lasers.serial_laser import OFF_TIMES
 from drivers.registry import KindConfig, Surroundings, lookup
@@ -79,7 +79,10 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
     seed: of everything simulated.
     tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic.
     Raises UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems.
+    Raises DeviceError for a laser or gate that must be guarded, where no guard can run.
     """
+    if any(getattr(config, slot).real_time for slot in GUARDED):
+        require_linux()  # before anything is opened
     with ExitStack() as stack:
         yield _open(config, seed, tap, stack)
 

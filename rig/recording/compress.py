@@ -65,6 +65,8 @@ def compress(run: PathLike) -> Compression:
             mine = found.entries[found.entries["segment"] == segment.number]
             try:
                 _compress(segment, np.sort(mine["offset"]).tolist())
+                segment.release()
+                segment.path.unlink()
             except OSError as error:
                 raise RecordingError(
                     f"cannot compress {segment.path}: {error.strerror or error}; free the space it needs"
@@ -75,7 +77,7 @@ def compress(run: PathLike) -> Compression:
 
 
 def _compress(segment: PlainSegment, offsets: list[int]) -> None:
-    """Write the compressed segment beside the plain one, check it, and remove the plain one."""
+    """Write the compressed segment beside the plain one and check it."""
     packer = zstandard_or_error().ZstdCompressor(level=LEVEL, write_checksum=True)
     packed = segment.path.with_name(segment.path.name + PACKED_SUFFIX)
     scratch = packed.with_name(f"{packed.name}.part")
@@ -98,4 +100,3 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
         sync_folder(packed.parent)
     finally:
         scratch.unlink(missing_ok=True)
-    segment.path.unlink()

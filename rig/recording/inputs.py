@@ -16,6 +16,7 @@ from typing import Any, Final, Literal, TypeVar, Union, get_args, get_origin, ge
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError, FileError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
@@ -190,7 +191,7 @@ def _read(kind: Any, content: Any, where: str) -> Any:
         if odd := ", ".join(sorted(set(names) ^ set(given))):
             raise ValueError(f"{where}: {odd} is unknown or missing; it was written by another version of the program")
         return kind(**{name: _read(hints[name], given[name], f"{where}.{name}") for name in names})
-    if origin is np.ndarray:
+    if origin in (np.ndarray, NDArray):  # from numpy 2.5 on NDArray is a name of its own
         dtype = np.dtype(_need(content, Mapping, where)["dtype"])
         if dtype.kind not in "biuf":
             raise ValueError(f"{where} holds {dtype}, which are no numbers")

@@ -78,6 +78,8 @@ def _put_in_order(found: Examination, done: list[str]) -> bool:
     if numbers == sorted(numbers):
         return False
     moves = [(paths[old], new) for old, new in zip(numbers, sorted(numbers), strict=True) if old != new]
+    for segment in found.segments:
+        segment.release()
     # First to free numbers, so that all files are still segments if the repair is killed.
     aside = [_numbered(path, number) for number, (path, _) in enumerate(moves, max(paths) + 1)]
     for (path, new), moved in zip(moves, aside, strict=True):
@@ -102,11 +104,13 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
             _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
+        segment.release()
         segment.path.unlink()
         done.append(f"{segment.path.name} removed, it holds no sound block")
         return
     if not others and segment.size == end:
         return
+    segment.release()
     with segment.path.open("rb+") as file:
         for begin, stop in others:
             file.seek(begin)
@@ -130,6 +134,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
             file.truncate(end)
             _copy(segment, blocks, file)
         scratch.replace(plain)
+    segment.release()
     segment.path.rename(torn)
     kept = f"its sound blocks are in {plain.name}, plain" if blocks else "it holds no sound block"
     done.append(f"{segment.path.name} is kept as {torn.name}; {kept}")

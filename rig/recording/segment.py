@@ -98,10 +98,10 @@ class OpenSegment:
             if self.end:
                 os.ftruncate(fd, self.end)
                 os.fsync(fd)
-            else:
-                self.path.unlink(missing_ok=True)
         finally:
             os.close(fd)
+        if not self.end:
+            self.path.unlink(missing_ok=True)  # Windows removes no open file
 
     def _write(self, pieces: Sequence[memoryview], offset: int) -> int:
         if hasattr(os, "pwritev"):

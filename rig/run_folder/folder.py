@@ -19,6 +19,7 @@ import os
 import re
 import secrets
 import shutil
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -351,7 +352,7 @@ def replace_file(file: Path, data: bytes) -> None:
 
 def sync_folder(path: Path) -> None:
     """Make sure that the names of the files in a folder survive a loss of power. Raises OSError."""
-    if os.name == "nt":
+    if sys.platform == "win32":
         return  # Windows opens no folders; NTFS keeps its names in a journal
     fd = os.open(path, os.O_RDONLY)
     try:

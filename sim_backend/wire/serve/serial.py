@@ -9,11 +9,11 @@ import os
 import select
 import tempfile
 import threading
-import tty
 from pathlib import Path
 from typing import Protocol
 
 from drivers.clock import Clock
+from drivers.errors import DeviceError
 from sim_backend.wire.serve.wire_server import WireServer
 
 BITS_PER_CHARACTER = 10
@@ -65,6 +65,10 @@ class SerialServer(WireServer[SerialModel]):
         with self.lock:
             if self._master is not None:
                 return
+            if not hasattr(os, "openpty"):
+                raise DeviceError("an emulated serial port is a pseudo terminal, which Windows has not; use Linux")
+            import tty
+
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)  # without it the terminal would echo what the device says before anybody opened it
             os.set_blocking(self._master, False)
