@@ -80,7 +80,7 @@ class MapRows:
             for first in (0,) if whole else np.unique(x0):
                 of_it = bins >= 0 if whole else (bins >= 0) & (x0 == first)
                 window = counts[:, first : first + pixels.shape[1]]
-                np.add.at(window, bins[of_it], pixels[of_it, : window.shape[1]])
+                _add_columns(window, bins[of_it], pixels[of_it, : window.shape[1]])
         seen = geometry.x_lo[row] <= geometry.x_hi[row]
         begin, end = (np.where(seen, px, 0).astype(np.int32) for px in (geometry.x_lo[row], geometry.x_hi[row] + 1))
         if plan.lines is not None:
@@ -131,6 +131,15 @@ class MapRows:
         raise UsageError(
             f"the marker that ends map {number} of {self._recording.path} is gone; 'rig verify' tells more"
         )
+
+
+def _add_columns(window: NDArray[np.uint16], bins: NDArray[np.int32], pixels: NDArray[np.uint8]) -> None:
+    """Add pixels (n, width) to the rows of `window` that `bins` (n,) names: first over frames that follow one another
+    in the same column, since adding frame by frame takes fifty times as long."""
+    if not len(bins):
+        return
+    starts = np.flatnonzero(np.r_[True, bins[1:] != bins[:-1]])
+    np.add.at(window, bins[starts], np.add.reduceat(pixels, starts, axis=0, dtype=np.uint16))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """The report on a calibration file: of what rig, how old, how it was judged, and what depth error it leaves."""
 
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +13,7 @@ from calibration.arrays import Array
 from calibration.depth_error import GROUPS, DepthUncertainty, depth_uncertainty
 from calibration.errors import digits, in_mm
 from calibration.model.rig_model import RigModel
-from rig.report.charts import Panel, Series, panel_svg
+from rig.report.charts import INK, Panel, Series, legend, panel_svg
 from rig.report.page import Section, page, paragraph, picture, preformatted, side_by_side, table, verdict_box
 from rig.run_folder.pictures import Scale, depth_limits
 
@@ -35,7 +35,9 @@ def calibration_report(
     failed = [f"{name}: {reason}" for name, note in notes.items() for reason in note.get("reasons") or ()]
     stated = None if identity is None else identity.verdict
     reasons = [*(identity.reasons if identity is not None else ()), *failed]
-    line = errors[-2].line() + "." if errors else "Its error is not known: it states no covariance."
+    line = (
+        f"Expected depth error {errors[-2].line()}." if errors else "Its error is not known: it states no covariance."
+    )
     word = "failed a check" if failed else str(stated) if stated is not None else "not judged"
     box = verdict_box(word, line, reasons, good=word == "passed")
     sections: list[Section] = [
@@ -57,7 +59,7 @@ def _about(model: RigModel, now: datetime) -> str:
         said = (" ".join(filter(None, (slot, identity.kinds.get(slot), identity.serials.get(slot)))) for slot in slots)
         rows.append(("devices", "; ".join(said) or "not known"))
         rows.append(("made", _dated(identity.created, now)))
-    rows += [(key, str(value)) for key, value in model.provenance.items()
+    rows += [(key, digits(value) if isinstance(value, float) else str(value)) for key, value in model.provenance.items()
              if isinstance(value, str | int | float) and key not in ("created", "verdict")]  # fmt: skip
     return table(("", ""), rows)
 
@@ -69,8 +71,13 @@ def _dated(created: str, now: datetime) -> str:
         return created or "not dated"
     if made.tzinfo is None:
         return created
-    days = (now - made).total_seconds() / 86400
-    return f"{made.astimezone(UTC):%Y-%m-%d %H:%M} UTC, {digits(max(days, 0.0), 2)} days ago"
+    return f"{made.astimezone(UTC):%Y-%m-%d %H:%M} UTC, {age_words(now - made)} ago"
+
+
+def age_words(age: timedelta) -> str:
+    """An age in days, or in hours if it is less than two days."""
+    hours = max(age.total_seconds(), 0.0) / 3600
+    return f"{hours:.0f} hours" if hours < 48 else f"{hours / 24:.0f} days"
 
 
 def _errors(model: RigModel) -> list[DepthUncertainty]:
@@ -83,32 +90,34 @@ def _expected(errors: Sequence[DepthUncertainty]) -> str:
     if not lit:
         return ""
     whole = [(each.depth_m, 1e3 * float(np.nanmedian(each.sd_m))) for each in lit]
-    series = [Series("", "#33404d", whole)]
+    series = [Series("all together", INK, whole)]
     rows = []
     for (group, words), colour in zip(GROUPS.items(), _COLOURS, strict=True):
         parts = [(each.depth_m, float(np.nanmedian(each.part_m[group]))) for each in lit]
-        series.append(
-            Series("", colour, [(z, 1e3 * sd) for z, sd in parts], names=[""] * (len(parts) - 1) + [words[4:]])
-        )
+        series.append(Series(f"from {words}", colour, [(z, 1e3 * sd) for z, sd in parts]))
         rows.append((f"from {words}", *(in_mm(sd) for _, sd in parts)))
     rows.append(("together", *(digits(sd) for _, sd in whole)))
     panel = Panel("Median over the picture", "depth, m", "standard deviation, mm", series)
     head = ("mm", *(f"at {each.depth_m:g} m" for each in lit))
     at = lit[-2] if len(lit) > 1 else lit[0]
-    return side_by_side([panel_svg(panel), table(head, rows)]) + uncertainty_section(at)[1]
+    return legend(series) + side_by_side([panel_svg(panel), table(head, rows)]) + uncertainty_picture(at)
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
     """Section with a picture of the expected depth error: bright where it is large, black where no scan reaches."""
     if not np.isfinite(uncertainty.sd_m).any():
         return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
+    rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
+    said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
+    return "Expected depth error", uncertainty_picture(uncertainty) + said
+
+
+def uncertainty_picture(uncertainty: DepthUncertainty) -> str:
+    """The picture alone."""
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
     large = enlarged_mm(uncertainty.sd_m)
     low, high = depth_limits(large) or (0.0, 1.0)
-    drawn = Scale(high, low, "mm", "inferno", absent="no scan").picture(large)
-    rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
-    said = paragraph("Its parts, each the median over the picture:") + table(("from", "mm"), rows)
-    return "Expected depth error", picture(drawn, caption) + said
+    return picture(Scale(high, low, "mm", "inferno", absent="no scan").picture(large), caption)
 
 
 def enlarged_mm(values_m: Array) -> NDArray[np.float32]:

@@ -30,6 +30,7 @@ h3 {{ font-size: 1em; margin: 1em 0 0.2em }}
 .wide {{ overflow-x: auto; margin: 0.4em 0 }}
 table {{ border-collapse: collapse; font-size: 0.92em }}
 td, th {{ padding: 0.15em 1.1em 0.15em 0; text-align: left; vertical-align: top }}
+.many td, .many th {{ white-space: nowrap }}
 tr + tr td {{ border-top: 1px solid #eef1f4 }}
 td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }}
 .side {{ display: flex; flex-wrap: wrap; gap: 4px 20px; align-items: flex-start }}
@@ -56,7 +57,9 @@ GENERATOR: Final = "spadrig"
 """Name of the generator in the head of a page, by which a report is recognised."""
 MOST_BYTES: Final = 2_000_000
 """Largest size of a report."""
-PICTURE_PX: Final = (512, 384, 256, 128)
+MANY_COLUMNS: Final = 5
+"""Tables with so many columns scroll on a phone rather than break their lines."""
+PICTURE_PX: Final = (512, 400, 320, 240, 120)
 """Longest side of embedded pictures; the smaller ones are for reports that would otherwise be too large."""
 JPEG_QUALITY: Final = 82
 """Quality of embedded photographs, of 0 to 100: finer structures than noise stay."""
@@ -118,8 +121,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
 
     top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
+    kind = ' class="many"' if len(head) >= MANY_COLUMNS else ""
     body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f'<div class="wide"><table>{top}{body}</table></div>'
+    return f'<div class="wide"><table{kind}>{top}{body}</table></div>'
 
 
 def picture(pixels: Picture, caption: str) -> str:

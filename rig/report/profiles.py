@@ -91,7 +91,7 @@ def _counts(run: RunFacts, row: int, of: str) -> Iterator[Panel]:
     end = min(round(at) + AROUND_PX + 1, counted.counts.shape[1])
     x = np.arange(first, end)
     single = counted.counts[column, first:end] / counted.frames[column]
-    mean = _mean_profile(counted, run.stripe, row, column)[first:end]
+    mean = mean_profile(counted, run.stripe, row, column)[first:end]
     haze = float(np.nan_to_num(run.stripe["haze"][row, column]))
     levels = [1 - math.exp(-run.ambient - haze), 1 - math.exp(-run.ambient)]
     left, right = levels if run.near_is_left else reversed(levels)
@@ -126,7 +126,7 @@ def _middle_column(run: RunFacts, row: int) -> int | None:
     return best if confidence[best] >= 0 else None
 
 
-def _mean_profile(counted: RowCounts, stripe: Mapping[str, Float32], row: int, column: int) -> NDArray[np.float64]:
+def mean_profile(counted: RowCounts, stripe: Mapping[str, Float32], row: int, column: int) -> NDArray[np.float64]:
     """Counts per exposure (width,), over the sure columns around one, with their stripes on that one's. NaN: none."""
     counts, x_px = counted.counts, stripe["x_px"][row]
     columns, width = counts.shape

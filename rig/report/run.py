@@ -12,6 +12,7 @@ import yaml
 
 from calibration.depth_error import depth_uncertainty
 from calibration.errors import CalibrationError, digits, in_mm, mm
+from rig.report.calibration import age_words
 from rig.report.page import (
     MOST_BYTES,
     PICTURE_PX,
@@ -30,7 +31,7 @@ from rig.report.page import (
 from rig.report.profiles import row_profiles
 from rig.report.run_facts import RunFacts
 from rig.run_folder.manifest import UNFINISHED
-from rig.run_folder.pictures import Scale, confidence_picture, depth_limits, depth_picture
+from rig.run_folder.pictures import SCALE_PX, Scale, confidence_picture, depth_limits, depth_picture
 from rig.run_folder.summary import RunVerdict
 from rig.simd import Float32
 
@@ -49,6 +50,9 @@ _CONFIDENCES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0000001)
 _MOST_GAPS: Final = 20
 _ERROR_M: Final = (1e-3, 1.0)
 """Ends of the scale of errors: a millimetre and a metre."""
+
+_COARSE: Final = 12
+"""Colours of pictures that are mostly noise: with 255 of them they would be most of the page."""
 
 Cell = Callable[[RunFacts], str]
 
@@ -128,12 +132,15 @@ def _pictures(runs: Sequence[RunFacts], most_px: int) -> str:
         return picture(confidence_picture(_thinned(run.confidence, most_px)), f"Confidence of each depth, {at}.")
 
     def counts(run: RunFacts, at: str) -> str:
-        return "" if run.counts is None else photograph(run.counts, f"Counts, {at}, with local contrast.", most_px)
+        if run.counts is None:
+            return ""
+        beside = np.pad(run.counts, ((0, 0), (0, SCALE_PX)), constant_values=255)  # as wide as those with a scale
+        return photograph(beside, f"Counts, {at}, with local contrast.", most_px + SCALE_PX)
 
     def error(run: RunFacts, at: str) -> str:
         if (error_m := _error_m(run)) is None:
             return ""
-        scale = Scale(_ERROR_M[1] * 1e3, _ERROR_M[0] * 1e3, "mm", "inferno", "unknown", log=True, steps=18)
+        scale = Scale(_ERROR_M[1] * 1e3, _ERROR_M[0] * 1e3, "mm", "inferno", "unknown", log=True, steps=_COARSE)
         drawn = scale.picture(_thinned(np.abs(error_m), most_px) * np.float32(1e3))
         return picture(drawn, f"Error of the depth, {at}; black: no depth or no truth.")
 
@@ -160,7 +167,9 @@ def _difference(first: RunFacts, second: RunFacts, most_px: int) -> str:
     if not known.size:
         return ""
     most = max(1e3 * float(np.percentile(np.abs(known), 95)), 0.1)
-    drawn = Scale(-most, most, "mm", absent="not both").picture(_thinned(off_m, most_px) * np.float32(1e3))
+    drawn = Scale(-most, most, "mm", absent="not both", steps=_COARSE).picture(
+        _thinned(off_m, most_px) * np.float32(1e3)
+    )
     said = (
         f"Depth of {second.name} minus that of {first.name}; bright: nearer, dark: farther. Median "
         f"{mm(float(np.median(known)))}, half of the pixels differ by less than {mm(float(np.median(np.abs(known))))}."
@@ -370,14 +379,12 @@ def _gaps(runs: Sequence[RunFacts]) -> str:
 def _calibration(runs: Sequence[RunFacts]) -> str:
     def provenance(run: RunFacts) -> str:
         said = {**(_at(run.manifest, "calibration.provenance") or {})}
-        return ", ".join(f"{key} {value}" for key, value in said.items() if isinstance(value, str | int | float)) or "-"
+        return ", ".join(f"{key} {value}" for key, value in said.items() if isinstance(value, str | int)) or "-"
 
     def age(run: RunFacts) -> str:
-        old = run.calibration_age
-        if old is None:
+        if run.calibration_age is None:
             return "not dated" if run.model is not None else "-"
-        days = old.total_seconds() / 86400
-        return f"{days:.1f} days" if days < 10 else f"{days:.0f} days"
+        return age_words(run.calibration_age)
 
     def verdict(run: RunFacts) -> str:
         identity = None if run.model is None else run.model.identity
@@ -476,9 +483,12 @@ def _error_m(run: RunFacts) -> Float32 | None:
 
 
 def _thinned(values: Float32, most_px: int) -> Float32:
-    """Every pixel, or every n-th along rows and columns of a map with more than `most_px` on its longer side."""
-    step = -(-max(values.shape) // most_px)
-    return values[::step, ::step]
+    """All pixels, or evenly spread ones if the longer side has more than `most_px`; means would blur edges."""
+    per_px = max(values.shape) / most_px
+    if per_px <= 1:
+        return values
+    rows, columns = (((np.arange(int(size / per_px)) + 0.5) * per_px).astype(np.intp) for size in values.shape)
+    return values[rows[:, None], columns]
 
 
 def _text(run: RunFacts, path: str, form: Callable[[Any], str] | None = None) -> str:

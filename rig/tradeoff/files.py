@@ -17,8 +17,8 @@ from drivers.json_text import parse_json
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.errors import UsageError
-from rig.report.charts import Panel, Series, chart_svg
-from rig.report.page import page, paragraph, preformatted, table, verdict_box
+from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
+from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
@@ -96,12 +96,20 @@ def _page(name: str, content: Mapping[str, Any], rows: Sequence[TradeoffRow]) ->
         f"Trade-off {name}",
         [box],
         [
-            ("Error over time", tradeoff_svg(rows, str(content["ci95_by"])) if rows else ""),
+            ("Error over time", _charts(rows, str(content["ci95_by"]))),
             ("All settings", table(head, cells) + paragraph(note, small=True)),
             ("Setting to use", preformatted(f"rig scan {SETTING_FILE}") if content.get("answer") else ""),
             ("Versions", table(("", ""), versions) if versions else ""),
         ],
     )
+
+
+def _charts(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
+    """The panels of the picture, as many beside each other as fit."""
+    panels = _panels(rows)
+    series = {series.label: series for panel in panels for series in panel.series}
+    notes = "".join(paragraph(note, small=True) for note in _notes(rows, ci95_by))
+    return legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels]) + notes
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}
@@ -111,20 +119,26 @@ OTHER_COLOUR = "#cc79a7"
 
 def tradeoff_svg(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
     """The picture as SVG text, without rows with too many answers missing. ci95_by: as in `Tradeoff`."""
+    return chart_svg(_panels(rows), title="What accuracy costs in time", notes=_notes(rows, ci95_by))
+
+
+def _panels(rows: Sequence[TradeoffRow]) -> list[Panel]:
     places = dict.fromkeys(row.place for row in rows)
-    shown = [row for row in rows if row.counts]
-    panels = [
-        _panel([row for row in shown if row.place == place], _named(*place), of)
+    return [
+        _panel([row for row in rows if row.place == place and row.counts], _named(*place), of)
         for place in places
         for of in ("sensor", "compute")
     ]
+
+
+def _notes(rows: Sequence[TradeoffRow], ci95_by: str) -> list[str]:
     notes = [
         "Numbers at points: exposures of a column. Bars: 95 % interval of the mean, over " + ci95_by + ".",
         "Yellow: nothing else has less error in as little time. Missing answers count as 10 px.",
     ]
-    if len(shown) < len(rows):
-        notes.append(f"Not shown, for more than 5 % of missing answers: {len(rows) - len(shown)} of {len(rows)} rows.")
-    return chart_svg(panels, title="What accuracy costs in time", notes=notes)
+    if hidden := sum(not row.counts for row in rows):
+        notes.append(f"Not shown, for more than 5 % of missing answers: {hidden} of {len(rows)} rows.")
+    return notes
 
 
 def colour_of(estimator: str) -> str:
