@@ -20,7 +20,7 @@ help:  ## this list
 # The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
 	$(MAKE) --jobs=2 --output-sync=target checks kernels
-	$(MAKE) docs
+	$(MAKE) docs NOTEBOOKS=off
 	$(PYTEST) --durations=25
 
 checks: lint types layers house
@@ -36,8 +36,10 @@ layers: .venv/.installed-tests
 	$(BIN)/lint-imports
 house: .venv/.installed-tests
 	$(BIN)/python -m tests.reference.house --limits
+# Notebooks are run while the site is built; `make test` leaves that to the tests.
+NOTEBOOKS ?= force
 docs: .venv/.installed-tests  ## the documentation site in docs/_build/html; its warnings are errors; needs no network
-	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . docs/_build/html
+	NOTEBOOKS=$(NOTEBOOKS) $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . docs/_build/html
 figures: .venv/.installed-tests  ## draw the figures of docs/figures/ anew
 	$(BIN)/python -m docs.generate.figures
 # Files of tests go to the workers whole: what they prepare once is prepared once.

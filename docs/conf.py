@@ -5,6 +5,7 @@ navigation, which follows the tables of docs/README.md, and what takes the place
 `<!-- generated: commands -->` (docs/generate/). Nothing comes from the network: no inventories, fonts or scripts.
 """
 
+import os
 import shutil
 import sys
 from importlib.metadata import version as installed
@@ -25,7 +26,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc"]
 # The source folder is the root of the repository, so that links between README.md, CONTRIBUTING.md and docs/ hold.
 root_doc = "README"
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "docs/**/*.md", "docs/**/*.ipynb"]
-include_patterns += ["docs/README.md"]
+include_patterns += ["docs/*.md", "examples/*/README.md"]
 exclude_patterns = [".*", "**/.*", "runs", "dist", "docs/_build"]
 exclude_patterns += ["calibration", "config", "drivers", "rig", "sim_backend", "tests"]
 
@@ -36,8 +37,7 @@ default_role = "code"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 
-nb_execution_mode = "cache"
-nb_execution_cache_path = str(ROOT / "docs" / "_build" / "notebooks")
+nb_execution_mode = os.environ.get("NOTEBOOKS", "force")  # or off, where tests run them
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True

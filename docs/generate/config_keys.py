@@ -1,6 +1,6 @@
 """The reference of keys in configs, scene files and plans, made of the models that check them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Literal, Union, get_args, get_origin
@@ -36,19 +36,26 @@ class Key:
 def page() -> str:
     """Tables of all keys: the config's own, those of each installed kind of device, scene files, plan.yaml."""
     own = [key for key in keys(RigConfig) if key.name.partition(".")[0] not in (*SLOTS, "scan", "estimate")]
-    parts = [
-        ("## Top level", own),
-        ("## scan", keys(ScanConfig)),
-        ("## estimate", keys(EstimateConfig)),
-        *((f"## {slot} of kind {kind}", keys(lookup(slot, kind).config)) for slot in SLOTS for kind in kinds(slot)),
-        ("## Scene files", keys(SceneFile)),
-        ("## plan.yaml of rig reconstruct", keys(CubePlan)),
-    ]
-    units = (
-        "## Units\n",
-        table(("quantity", "units"), [(one.name, ", ".join(one.units)) for one in DIMENSIONS.values()]),
-    )
-    return "\n".join([*(f"{head}\n\n{_table(list(found))}" for head, found in parts), *units])
+    parts = {
+        "Top level": _table(own),
+        "scan": _table(keys(ScanConfig, "scan.")),
+        "estimate": _table(keys(EstimateConfig, "estimate.")),
+        **{f"{slot} of kind {kind}": _of_kind(slot, kind) for slot in SLOTS for kind in kinds(slot)},
+        "Scene files": _table(keys(SceneFile)),
+        "plan.yaml of rig reconstruct": _table(keys(CubePlan)),
+        "Units": table(("quantity", "units"), [(one.name, ", ".join(one.units)) for one in DIMENSIONS.values()]),
+    }
+    return "\n".join(f"### {heading}\n\n{text}" for heading, text in parts.items())
+
+
+def _of_kind(slot: str, kind: str) -> str:
+    """The keys of a kind; without those of another kind of the slot on which it builds, which is named."""
+    model = lookup(slot, kind).config
+    bases = {one: lookup(slot, one).config for one in kinds(slot) if one != kind}
+    base = next((one for one, config in bases.items() if issubclass(model, config)), None)
+    known = set() if base is None else {key.name for key in keys(bases[base])}
+    text = "" if base is None else f"All keys of kind {base}, and\n\n"
+    return text + _table(key for key in keys(model, f"{slot}.") if key.name.removeprefix(f"{slot}.") not in known)
 
 
 def keys(model: type[BaseModel], before: str = "") -> Iterator[Key]:
@@ -63,7 +70,7 @@ def keys(model: type[BaseModel], before: str = "") -> Iterator[Key]:
             yield from keys(section, f"{before}{name}.")
 
 
-def _table(found: Sequence[Key]) -> str:
+def _table(found: Iterable[Key]) -> str:
     rows = list(dict.fromkeys(key.row() for key in found))
     return table(HEAD, rows) if rows else "No keys but `kind`.\n"
 

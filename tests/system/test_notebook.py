@@ -1,4 +1,4 @@
-"""The calls of docs/tutorials/notebook.md, on a rig small enough for a test."""
+"""The calls of docs/how-to/python.md, on a rig small enough for a test."""
 
 import gc
 from pathlib import Path
@@ -9,7 +9,7 @@ from drivers.ring import BlockRing
 from rig.api import effects, plan_scan, plan_text, scan
 from tests.system.small_rig import HEIGHT, WIDTH
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "tutorials" / "notebook.md"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "how-to" / "python.md"
 
 
 def test_a_scan_is_one_call_and_writes_nothing_unasked(

@@ -12,13 +12,19 @@ from typing import Any
 import pytest
 import typer
 
+from docs.generate import MARK, config_keys, fill, sections
+from docs.generate.commands import commands
 from rig.cli.main import app
 from rig.config.bundled import bundled_rigs, bundled_scenes
 from sim_backend.effects.catalogue import CATALOGUE
-from sim_backend.scenes.scene import SceneFile
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
+TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+BUILT = ROOT / "docs" / "_build"
+NOTEBOOKS = sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))
+PAGES = sorted(
+    [*(ROOT / name for name in TOP), *(p for p in (ROOT / "docs").rglob("*.md") if BUILT not in p.parents), *NOTEBOOKS]
+)
 PACKAGES = ("rig", "drivers", "calibration", "sim_backend", "tests")
 TREES = (*PACKAGES, "config", "docs")
 pages = pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
@@ -44,11 +50,55 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not heading or heading in anchors(target), link
 
 
-def test_every_effect_has_a_row_and_every_key_of_a_scene_is_named() -> None:
+def test_every_page_is_listed_in_the_index_and_so_in_the_navigation_of_the_site() -> None:
+    listed = {
+        (ROOT / "docs" / page).resolve()
+        for pages_of in sections((ROOT / "docs" / "README.md").read_text()).values()
+        for page in pages_of
+    }
+    unlisted = [page for page in PAGES if page.with_suffix("") not in listed and page.stem != "README"]
+    assert [str(page.relative_to(ROOT)) for page in unlisted] == []
+
+
+def test_every_effect_has_a_row() -> None:
     rows = (ROOT / "docs" / "explanation" / "simulation.md").read_text()
     assert [entry.name for entry in CATALOGUE if f"`{entry.name}`" not in rows] == []
-    keys = (ROOT / "docs" / "reference" / "config.md").read_text()
-    assert [name for name in SceneFile.model_fields if not re.search(rf"^\| .*`{name}[.`]", keys, re.M)] == []
+
+
+def test_every_key_of_a_config_has_a_meaning_in_the_reference() -> None:
+    rows = [row for row in config_keys.page().splitlines() if row.startswith("| `")]
+    assert len(rows) > 200
+    assert [row for row in rows if row.split("|")[-2].strip() == ""] == []
+
+
+def test_every_command_has_a_section_with_its_options() -> None:
+    text = fill((ROOT / "docs" / "reference" / "commands.md").read_text())
+    for name, command in commands(typer.main.get_command(app), "rig"):
+        section = re.search(rf"^#+ {name}\n(.*?)(?=^#|\Z)", text, re.M | re.S)
+        if name != "rig":
+            assert section is not None, name
+            own = [] if hasattr(command, "commands") else [one for one in options(command) if one[:2] == "--"]
+            assert [one for one in own if one != "--help" and one not in section[1]] == [], name
+
+
+def test_generated_parts_are_those_that_generators_make() -> None:
+    marks = [mark for page in PAGES for mark in MARK.findall(page.read_text())]
+    assert sorted(marks) == ["commands", "config keys", "python api"]
+    with pytest.raises(KeyError, match="nothing"):
+        fill("<!-- generated: nothing -->")
+
+
+def test_figures_are_shown_described_and_small() -> None:
+    shown = set()
+    for page in PAGES:
+        for drawn, words, link in re.findall(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", page.read_text()):
+            assert not drawn or len(words) > 20, f"{page}: {link} is not described"
+            shown.add((page.parent / link).resolve())
+    for figure in (ROOT / "docs" / "figures").iterdir():
+        assert figure in shown, f"no page shows {figure.name}"
+        assert figure.suffix == ".svg"
+        assert figure.stat().st_size < 100_000
+        assert not re.search(r'(?:href|src)="(?!#)', figure.read_text()), f"{figure.name} refers to something outside"
 
 
 @pages
@@ -165,7 +215,7 @@ def test_a_line_that_the_command_line_refuses_is_found(line: str, problem: str) 
 
 def anchors(page: Path) -> set[str]:
     """What the headings of a page are linked by."""
-    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+    headings = re.findall(r"^#+ (.*)$", fill(page.read_text()), re.M)
     return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
 
 
@@ -177,14 +227,16 @@ def inline_code(text: str) -> list[str]:
 def missing_files(code: str) -> list[str]:
     """Python files named in a piece of code, and files and folders named from the root, that do not exist."""
     named = re.findall(r"(?<![\w./*-])[\w./*-]+(?:\.\w+|/)(?![\w./*-])", code)
+    hides = [f"{package}.py" for package in PACKAGES]  # a file of others that would hide ours
     ours = [name for name in named if name.endswith(".py") or name.startswith(tuple(f"{tree}/" for tree in TREES))]
+    ours = [name for name in ours if name not in hides]
     return [name for name in ours if not (ROOT / name).exists()]
 
 
 def missing_names(code: str) -> list[str]:
     """Dotted names of our packages in a piece of code, such as `rig.x` or `rig.x.Y`, that cannot be imported."""
     named = re.findall(rf"(?<![\w./*-])(?:{'|'.join(PACKAGES)})(?:\.\w+)+(?![\w./*-])", code)
-    return [name for name in named if not name.endswith((".json", ".yaml")) and not is_importable(name)]
+    return [name for name in named if not name.endswith((".json", ".yaml", ".py")) and not is_importable(name)]
 
 
 def is_importable(name: str) -> bool:
