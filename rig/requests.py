@@ -230,6 +230,16 @@ class ViewRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StreamRequest:
+    """A stream of depth maps for other programs (`rig stream`)."""
+
+    host: str = option("127.0.0.1", "address to listen on; 0.0.0.0 is the whole network, with a token")
+    port: int = option(8766, "to listen on; 0 takes any free one")
+    token: str | None = option(None, "that clients must send", unset="none on 127.0.0.1, else made anew")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CutRequest:
     """A part of a recording (`rig cut`). Give exactly one of `maps`, `frames` and `time`."""
 

@@ -27,13 +27,15 @@ class SeenMap:
     """A map that was just made, for `on_map`.
 
     number: of the map, from 0, over all scans of the call. left: maps still to come. result: depth, stripes, counts.
-    sweep: its frames and gaps. config: with which it was taken.
+    sweep: its frames and gaps. taken: `utc` of its first and last frame and `utc_uncertainty_s`. config: with which it
+    was taken.
     """
 
     number: int
     left: int
     result: MapResult
     sweep: SweepAccount
+    taken: Mapping[str, Any]
     config: RigConfig
 
 
@@ -63,7 +65,8 @@ class Steering:
         if self._on_map is None:
             return False
         try:
-            self._changes = self._on_map(SeenMap(number, left, found.result, found.sweep, self._config)) or None
+            seen = SeenMap(number, left, found.result, found.sweep, found.taken, self._config)
+            self._changes = self._on_map(seen) or None
         except Exception as error:  # of the caller's code: the maps so far are kept
             self._error = error
         return left > 0 and (self._changes is not None or self._error is not None)

@@ -1,13 +1,17 @@
-"""The command `rig view`, which serves the page of a run."""
+"""The commands that serve a run to others: `rig view` the page, `rig stream` the depth for other programs."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.command import Answer, Commands, asks, say
 from rig.errors import UsageError
-from rig.requests import ViewRequest
+from rig.requests import StreamRequest, ViewRequest
+
+if TYPE_CHECKING:
+    from rig.stream.server import DepthServer
 
 
 @asks(ViewRequest)
@@ -36,4 +40,23 @@ def view_command(
     return Answer({"url": address[0]}, lambda: None)
 
 
-COMMANDS: Commands = {"view": view_command}
+@asks(StreamRequest)
+def stream_command(request: StreamRequest) -> Answer:
+    """Send the depth maps of running scans to other programs over TCP, until Ctrl-C."""
+    from rig.stream.server import serve
+
+    address: list[str] = []
+
+    def ready(server: "DepthServer") -> None:
+        host, port = server.address
+        address.append(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
+        say(f"stream: {address[0]}")
+        if server.token is not None:
+            say(f"token: {server.token}")
+
+    counts = serve(request, ready=ready)
+    said = f"{counts.clients} clients were served {counts.maps_sent} maps, {counts.refused} were refused"
+    return Answer({"address": address[0], **asdict(counts)}, lambda: print(said))
+
+
+COMMANDS: Commands = {"view": view_command, "stream": stream_command}

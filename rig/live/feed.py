@@ -296,6 +296,7 @@ def map_content(found: AcquiredMap, estimator: str) -> tuple[dict[str, Any], dic
         "gaps": [list(gap) for gap in found.sweep.gaps[:MOST_GAPS]],
         "doubts": list(result.doubts),
         "unix_time_s": time.time(),
+        **found.taken,
     }
     camera = {name: getattr(result, name) for name in ("depth_m", "confidence", "depth_sd_m", "intensity")}
     # The stripe table has a `confidence` too, (rows, columns), which a run's folder keeps in another file.

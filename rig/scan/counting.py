@@ -7,9 +7,10 @@ ended.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +29,15 @@ class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
     column: float64 (columns,), mean fractional column of each column's frames; its own number if it has none.
-    compute_s: seconds of binding, counting and estimation, see `SharedTime`.
+    compute_s: seconds of binding, counting and estimation, see `SharedTime`. taken: when its first and last frame were
+    taken, as in the manifest (`utc`, `utc_uncertainty_s`), by the arrivals so far; empty if it is not known.
     """
 
     sweep: SweepAccount
     column: NDArray[np.float64]
     result: MapResult
     compute_s: float
+    taken: Mapping[str, Any] = field(default_factory=dict)
 
 
 class MapQueue:

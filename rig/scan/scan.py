@@ -151,6 +151,9 @@ def run_scan(
     try:
         with closing(acquisition.run()) as running:
             for found in running:
+                if times is not None:
+                    (taken,) = times.of_maps([_span(found.sweep)])
+                    found = replace(found, taken=taken)
                 truth = facts.truth(found.sweep, found.column)
                 if kept is not None and not sweeps:
                     used = reconstructor.kept_serves
@@ -172,7 +175,7 @@ def run_scan(
     counters, stages = acquisition.counters, acquisition.stages
     outside = [] if ended_by is not None else facts.lost_outside(sweeps)
     frames = frames_of(sweeps, counters.crc_errors, outside)
-    of_maps = [] if times is None else times.of_maps([(s.index, s.first_frame, s.end_frame - 1) for s in sweeps])
+    of_maps = [] if times is None else times.of_maps([_span(sweep) for sweep in sweeps])
     summary = run.tally.summary(
         frames=frames if ended_by is None else frames_that_came(frames, counters, stages.dropped_frames),
         sensor_time_s=frames.expected / float(plan.frame_rate_hz) + plan.readout_s(frames.expected),
@@ -274,6 +277,11 @@ def recording_space(
     map_bytes = BYTES_PER_PIXEL * plan.rows * max(plan.width, plan.columns)
     frames_bytes = (math.ceil(frames / block_frames) + starts) * block_bytes
     return Space.on_disk_of(folder, frames_bytes, map_bytes * save.count(facts.maps))
+
+
+def _span(sweep: SweepAccount) -> tuple[int, int, int]:
+    """Number, first and last frame of a sweep."""
+    return sweep.index, sweep.first_frame, sweep.end_frame - 1
 
 
 def _held(rig: OpenRig, plan: ScanPlan, timing: SpadTiming, before_s: float) -> tuple[int, int]:
