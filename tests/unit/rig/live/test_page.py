@@ -1,0 +1,70 @@
+"""The process with the live page: it is started for a run, waited for, and ended."""
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rig.errors import UsageError
+from rig.live import page as page_module
+from rig.live.page import end_page, page_problem, start_page
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A stand-in for the viewer. `said`: the arguments that it got."""
+    file = tmp_path / "python"
+    code = (
+        "import pathlib, socket, sys, time\n"
+        f"pathlib.Path({str(tmp_path / 'said')!r}).write_text(' '.join(sys.argv[1:]))\n"
+        "if '--port' in sys.argv and sys.argv[sys.argv.index('--port') + 1] == '1': sys.exit(2)\n"
+        "server = socket.create_server(('127.0.0.1', int(sys.argv[sys.argv.index('--port') + 1])))\n"
+        "time.sleep(60)\n"
+    )
+    (tmp_path / "viewer.py").write_text(code)
+    file.write_text(f'#!/bin/sh\nshift 2\nexec "{sys.executable}" {tmp_path / "viewer.py"} "$@"\n')
+    file.chmod(0o700)
+    monkeypatch.setattr(page_module, "page_problem", lambda: None)
+    monkeypatch.setattr(page_module.sys, "executable", str(file))
+    return tmp_path / "said"
+
+
+@pytest.mark.parametrize(("stays", "more"), [(False, " --until-closed"), (True, "")])
+def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, more: str) -> None:
+    page = start_page(stays=stays, port=port)
+    try:
+        with socket.create_connection(("127.0.0.1", port), 1):
+            assert program.read_text() == f"view --live --port {port}{more}"
+    finally:
+        end_page(page)
+    assert page.poll() is not None
+
+
+def test_a_page_that_ends_at_once_is_not_waited_for(program: Path) -> None:
+    assert start_page(port=1).poll() == 2
+
+
+def test_without_viser_there_is_a_sentence_with_the_command_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "find_spec", lambda name: None)
+    assert "needs viser; install it: " in (page_problem() or "")
+    with pytest.raises(UsageError, match='-m pip install "viser'):
+        start_page()
+
+
+def test_a_page_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "READY_S", 0.2)
+    code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(1, flush=True); time.sleep(60)"
+    stubborn = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert stubborn.stdout is not None
+    with stubborn.stdout:
+        stubborn.stdout.readline()
+        end_page(stubborn)
+    assert stubborn.returncode == -9
