@@ -73,7 +73,7 @@ def message(kind: Kind, about: Mapping[str, Any], arrays: Mapping[str, NDArray[A
         plain = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         places.append({"name": name, "dtype": plain.dtype.str, "shape": list(plain.shape), "offset": at})
         padded = -(-plain.nbytes // ALIGN) * ALIGN
-        pieces += [memoryview(plain.reshape(-1).view(np.uint8)), memoryview(bytes(padded - plain.nbytes))]
+        pieces += [plain.reshape(-1).view(np.uint8).data, memoryview(bytes(padded - plain.nbytes))]
         at += padded
     text = json.dumps({**about, "arrays": places}, allow_nan=False).encode()
     return [
