@@ -45,11 +45,12 @@ class MapRows:
     """The rows of a recording's maps. Raises UsageError if there is no recording or it has no plan, and
     DamagedRecordingError if it cannot be read.
 
-    maps: numbers of its whole maps.
+    maps: numbers of its whole maps. problems: a line for each damaged part of the recording, as `rig verify` has them.
     """
 
     def __init__(self, folder: Path) -> None:
         self._recording = open_recording(folder)
+        self.problems = tuple(self._recording.problems)
         self.plan: ScanPlan = read_plan(folder)
         self.model: RigModel | None = read_model(folder)
         manifest = read_manifest(folder) or {}

@@ -229,8 +229,7 @@ def _fog(runs: Sequence[RunFacts]) -> str:
         name, _, per = key.partition("_")
 
         def cell(run: RunFacts) -> str:
-            fog = run.summary.get("fog") or {}
-            value, sd = _number(fog.get(key)), _number(fog.get(f"{name}_sd_{per}"))
+            value, sd = (_number(_at(run.summary, f"fog.{each}")) for each in (key, f"{name}_sd_{per}"))
             if value is None:
                 return "-"
             return digits(value) + (f" +- {digits(sd, 2)}" if sd is not None else "") + unit
@@ -350,10 +349,7 @@ def _stages(runs: Sequence[RunFacts]) -> str:
 
     rows = [(words, stage(key)) for key, words in _STAGES]
     rows += [
-        (
-            "ring, most slots in use",
-            lambda run: f"{_text(run, 'stages.ring_high_water')} of {_text(run, 'stages.ring_slots')}",
-        ),
+        ("slots of the ring in use", lambda run: _of_all(run, "stages.ring_high_water", "stages.ring_slots")),
         ("frames dropped for want of room", lambda run: _text(run, "stages.dropped_frames")),
     ]
     return _compared(runs, rows) + paragraph("Stages run at the same time, so times do not add up.", small=True)

@@ -83,7 +83,8 @@ class RunFacts:
     @property
     def ambient(self) -> float:
         """Ambient light of the last map, in photons per pixel and exposure; 0 if none was measured."""
-        value = (self.summary.get("fog") or {}).get("ambient_per_exposure")
+        fog = self.summary.get("fog")
+        value = fog.get("ambient_per_exposure") if isinstance(fog, Mapping) else None
         return float(value) if isinstance(value, int | float) else 0.0
 
 
@@ -100,8 +101,8 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     Raises UsageError if the run has no map of this number.
     """
     reader = _Reader(folder)
-    manifest = reader.get(MANIFEST, lambda: read_manifest(folder), "the manifest") or {}
-    summary = reader.get(SUMMARY, lambda: _json(folder / SUMMARY), "the summary") or {}
+    manifest = reader.file(MANIFEST, _manifest, "the manifest") or {}
+    summary = reader.file(SUMMARY, _json, "the summary") or {}
     recorded = (folder / INDEX_FILE).exists()
     numbers = tuple(sorted(int(file.stem) for file in folder.glob("stripe/*.npz") if file.stem.isdigit()))
     counted = _counted_maps(folder, reader) if recorded else None
@@ -118,6 +119,8 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     facts["rows"] = _rows(facts, counted)
     if counted is not None and shown in counted.maps:
         facts |= _counts(reader, counted, shown, facts)
+    elif counted is not None and shown is not None:
+        reader.missing.append(f"The frames of map {shown} are not whole in the recording, so it has no counts.")
     elif not recorded:
         reader.missing.append("The frames were not recorded (--record), so rows are shown without their counts.")
     facts["model"] = reader.get("calibration", lambda: _model(folder, manifest), "the calibration")
@@ -178,7 +181,11 @@ def _rows(found: Mapping[str, Any], counted: MapRows | None) -> tuple[int, ...]:
 
 
 def _counted_maps(folder: Path, reader: _Reader) -> MapRows | None:
-    return reader.get("frames", lambda: MapRows(folder), "the recording's frames")
+    counted = reader.get("frames", lambda: MapRows(folder), "the recording's frames")
+    if counted is not None and counted.problems:
+        first = counted.problems[0].rstrip(".")
+        reader.missing.append(f"The recording is damaged, rig verify tells more ({len(counted.problems)}: {first}).")
+    return counted
 
 
 def _counts(reader: _Reader, counted: MapRows, number: int, found: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,6 +212,13 @@ def _model(folder: Path, manifest: Mapping[str, Any]) -> RigModel | None:
         return None
     model = load_rig_model(named)
     return model if model.fingerprint() == wanted else None
+
+
+def _manifest(file: Path) -> dict[str, Any]:
+    content = read_manifest(file.parent)
+    if content is None:
+        raise FileNotFoundError(file)
+    return content
 
 
 def _json(file: Path) -> dict[str, Any]:
