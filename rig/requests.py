@@ -201,7 +201,7 @@ class SoakRequest:
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunsRequest:
-    """Which runs of a folder to list (`rig runs`). A run is listed if it passes every filter that is given."""
+    """A list of the runs in a folder (`rig runs`). A run is listed if it passes every filter that is given."""
 
     tags: Sequence[str] = option((), "with all of these tags, separated by commas", unset="any", name="tag")
     note: str | None = option(None, "with this text in the note, in capital or small letters", unset="any")

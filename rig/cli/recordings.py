@@ -53,7 +53,8 @@ def repair_command(run: RunArgument) -> Answer:
 
 def info_command(run: RunArgument) -> Answer:
     """Describe what a recording holds."""
-    found = api.recording_info(run)
+    with progress(compiles=False):
+        found = api.recording_info(run)
     return Answer(asdict(found), lambda: _show_info(found))
 
 
@@ -123,7 +124,7 @@ def _show_info(found: "RecordingInfo") -> None:
 
 
 def _taken(run: "RunInfo") -> str:
-    """When a start was taken, in words; empty if the recording does not say."""
+    """The time of day of a start, in words; empty if the recording does not say."""
     if run.first_frame_utc is None:
         return ""
     sure = "simulated time" if run.utc_uncertainty_s is None else f"+- {run.utc_uncertainty_s * 1e3:.3g} ms"
@@ -142,7 +143,8 @@ def runs_command(
     ] = Path("runs"),
 ) -> Answer:
     """List the runs in a folder, the newest last: when, what, with which verdict, note, tags and size."""
-    found = api.runs(folder, request)
+    with progress(compiles=False):
+        found = api.runs(folder, request)
     content = {"runs": [{**asdict(entry), "taken": f"{entry.taken:%Y-%m-%dT%H:%M:%SZ}"} for entry in found]}
     return Answer(content, lambda: tables.runs_table(found))
 

@@ -25,7 +25,7 @@ from typing import Any, Final, Literal, NamedTuple
 from drivers.interfaces import SpadTiming
 
 Scale = Literal["host", "virtual", "recorded"]
-"""Where times of day come from: measured with the host's clock; a simulated rig's own time, in which nothing was
+"""Sources of times of day: measured with the host's clock; a simulated rig's own time, in which nothing was
 exposed at the moment stated; or taken over from a recording."""
 
 NS: Final = 1_000_000_000
@@ -80,7 +80,7 @@ class Stamp(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """Where the frames of one start lie in UTC: frame 0 at `utc_ns`, the others by their period.
+    """The place of the frames of one start in UTC: frame 0 at `utc_ns`, the others by their period.
 
     tick: of frame 0. uncertainty_s: of frame 0; None in virtual time. rate_error: by how much a second of the device is
     longer than one of the host, as a share; 0 where it is not measured. rate_uncertainty: how far that may be off.
@@ -299,7 +299,7 @@ class RecordedTimes:
         }
 
     def of_maps(self, maps: Sequence[tuple[int, int, int]]) -> list[dict[str, Any]]:
-        """As `TimeOfDay.of_maps`, of what was recorded."""
+        """The same as `TimeOfDay.of_maps`, of what was recorded."""
         return [self._of_maps[number % len(self._of_maps)] for number, _, _ in maps]
 
 
@@ -309,7 +309,7 @@ def _time_keys(sweep: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class RunTime:
-    """When the maps of a run were taken, as text in UTC: the first frame of the first map, the last frame of the last.
+    """The time at which the maps of a run were taken: the first frame of the first, the last frame of the last, in UTC.
 
     scale: as in the manifest. uncertainty_s: the larger of the two; None in virtual time.
     """

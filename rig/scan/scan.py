@@ -237,7 +237,7 @@ class LiveFacts:
         return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
 
     def times(self, timing: SpadTiming) -> TimeOfDay:
-        """What will note when frames are exposed."""
+        """The object that will note when frames are exposed."""
         return TimeOfDay(timing, "virtual" if isinstance(self._rig.clock, VirtualClock) else "host")
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:

@@ -15,7 +15,7 @@ from drivers.json_text import parse_json
 MAGIC: Final = b"SPDS"
 VERSION: Final = 1
 HEAD: Final = struct.Struct("<4sHHII")
-"""MAGIC, VERSION, `Kind`, bytes of the JSON, bytes of the arrays."""
+"""MAGIC, VERSION, `MessageKind`, bytes of the JSON, bytes of the arrays."""
 ALIGN: Final = 8
 """Arrays begin at multiples of this, counted from the first one."""
 MOST_HELLO: Final = 4096
@@ -26,7 +26,7 @@ USUAL: Final = ("depth_m", "confidence")
 """Arrays for a client that names none."""
 
 
-class Kind(IntEnum):
+class MessageKind(IntEnum):
     """Kinds of messages."""
 
     SETUP = 1
@@ -35,7 +35,7 @@ class Kind(IntEnum):
     STATUS = 3
     """Once a second: whether a scan goes on, and its figures."""
     ERROR = 4
-    """Why the connection ends."""
+    """The reason for which the connection ends."""
 
 
 class Hello(NamedTuple):
@@ -46,7 +46,7 @@ class Hello(NamedTuple):
 
 
 def read_hello(line: bytes) -> Hello:
-    """What a client asks for, a JSON object in one line; an empty line asks for the usual. Raises ValueError, with a
+    """The wishes of a client, a JSON object in one line; an empty line asks for the usual. Raises ValueError, with a
     message for the client."""
     if len(line) > MOST_HELLO or not line.endswith(b"\n"):
         raise ValueError(f"the first line must end within {MOST_HELLO} bytes")
@@ -65,7 +65,9 @@ def read_hello(line: bytes) -> Hello:
     return Hello(token, tuple(dict.fromkeys(arrays)))
 
 
-def message(kind: Kind, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None) -> list[memoryview]:
+def message(
+    kind: MessageKind, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
+) -> list[memoryview]:
     """The pieces of a message. `arrays` in its JSON says of each array its name, dtype (as numpy writes it), shape and
     offset. The arrays are not copied, unless they are of another byte order or not in one piece."""
     places, pieces, at = [], [], 0

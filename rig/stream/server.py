@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rig.errors import UsageError
 from rig.live.slot import SlotReader
 from rig.requests import StreamRequest
-from rig.stream.messages import MOST_HELLO, Hello, Kind, message, read_hello
+from rig.stream.messages import MOST_HELLO, Hello, MessageKind, message, read_hello
 from rig.view.access import Access
 
 _log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class DepthServer:
     def __init__(self, request: StreamRequest) -> None:
         access = Access.to(request.host, request.port, request.token)
         self.token = access.token
-        """What clients must send; None for nobody."""
+        """The token that clients must send; None for nobody."""
         self.counts = StreamCounts()
         self._newest = _Newest()
         self._changed = threading.Condition()
@@ -191,7 +191,7 @@ class DepthServer:
                 if why or hello is None:
                     with self._changed:
                         self.counts.refused += 1
-                    _send(client, message(Kind.ERROR, {"error": why}))
+                    _send(client, message(MessageKind.ERROR, {"error": why}))
                     return
                 client.settimeout(STUCK_S)
                 with self._changed:
@@ -225,18 +225,18 @@ class DepthServer:
                 run = now.run
             if now.setup is not None and setup_of != run:
                 setup_of = run
-                _send(client, message(Kind.SETUP, {"run": run, **now.setup[0]}, now.setup[1]))
+                _send(client, message(MessageKind.SETUP, {"run": run, **now.setup[0]}, now.setup[1]))
             if now.map is not None and setup_of == run and (index is None or now.index > index):
                 header, arrays = now.map
                 missed = 0 if index is None else now.index - index - 1
                 wanted = {name: arrays[name] for name in hello.arrays if name in arrays}
-                _send(client, message(Kind.MAP, {"run": run, "missed": missed, **header}, wanted))
+                _send(client, message(MessageKind.MAP, {"run": run, "missed": missed, **header}, wanted))
                 index = now.index
                 with self._changed:
                     self.counts.maps_sent += 1
             if now.state != state or time.monotonic() - told_s >= STATUS_S:
                 state, told_s = now.state, time.monotonic()
-                _send(client, message(Kind.STATUS, {"run": run, "state": state, **now.status}))
+                _send(client, message(MessageKind.STATUS, {"run": run, "state": state, **now.status}))
 
     def _next_after(self, serial: int) -> _Newest | None:
         """The state once it is another one than that of this number, or after STATUS_S; None at the server's end."""

@@ -1,8 +1,10 @@
 """`on_map`: a callback that sees each map and may change the next scan, within what the config and the laser allow."""
 
 import json
+import re
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +139,18 @@ def test_without_a_folder_nothing_is_written_and_the_results_are_all_there(small
     result = api.scan(small, maps=2, on_map=lambda seen: {"exposures": 5})
     assert [run.summary.exposures for run in (*result.earlier, result)] == [4, 5]
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_python_of_the_page_runs(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a small rig in the place of the bundled one."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(api, "scan", partial(api.scan, small))
+    page = (Path(__file__).parents[3] / "docs/how-to/steer.md").read_text()
+    place: dict[str, Any] = {}
+    for code in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
+        exec(compile(code, "steer.md", "exec"), place)
+    assert sum(run.summary.maps for run in (*place["result"].earlier, place["result"])) == 4
+    assert api.verify("runs/parts/part-000").exit_code == 0
 
 
 @pytest.mark.slow

@@ -6,13 +6,13 @@ import struct
 import numpy as np
 import pytest
 
-from rig.stream.messages import ARRAYS, MOST_HELLO, USUAL, Hello, Kind, message, read_hello
+from rig.stream.messages import ARRAYS, MOST_HELLO, USUAL, Hello, MessageKind, message, read_hello
 
 
 def test_a_message_has_the_bytes_that_the_page_says() -> None:
     depth_m = np.array([[1.5, np.nan, 2.0]], ">f4")
     counts = np.array([[1], [2]], np.uint32)
-    sent = b"".join(message(Kind.MAP, {"index": 7}, {"depth_m": depth_m, "intensity": counts}))
+    sent = b"".join(message(MessageKind.MAP, {"index": 7}, {"depth_m": depth_m, "intensity": counts}))
     assert sent[:4] == b"SPDS"
     assert sent[4:8] == b"\x01\x00\x02\x00"
     json_bytes, array_bytes = struct.unpack("<II", sent[8:16])
@@ -34,12 +34,12 @@ def test_a_message_has_the_bytes_that_the_page_says() -> None:
 
 def test_arrays_that_are_views_come_in_order() -> None:
     whole = np.arange(12, dtype=np.float32).reshape(3, 4)
-    sent = b"".join(message(Kind.SETUP, {}, {"u": whole[:, ::2]}))
+    sent = b"".join(message(MessageKind.SETUP, {}, {"u": whole[:, ::2]}))
     assert np.frombuffer(sent[-24:], "<f4").tolist() == [0, 2, 4, 6, 8, 10]
 
 
 def test_a_message_without_arrays_is_head_and_json() -> None:
-    (only,) = message(Kind.ERROR, {"error": "why"})
+    (only,) = message(MessageKind.ERROR, {"error": "why"})
     assert bytes(only[12:16]) == bytes(4)
     assert json.loads(bytes(only[16:])) == {"error": "why", "arrays": []}
 

@@ -297,10 +297,10 @@ def test_the_client_of_the_page_runs_as_it_is_written(slot: SlotWriter, server: 
 
 
 def test_the_page_names_every_kind_and_array_and_the_limits() -> None:
-    from rig.stream.messages import ARRAYS, MAGIC, MOST_HELLO, VERSION, Kind
+    from rig.stream.messages import ARRAYS, MAGIC, MOST_HELLO, VERSION, MessageKind
 
     page = (ROOT / "docs/reference/depth-stream.md").read_text()
-    for kind in Kind:
+    for kind in MessageKind:
         assert f"{kind.value} {kind.name.lower()}" in page
         assert f"\n| {kind.name.lower()} |" in page
     assert all(f"`{name}`" in page for name in ARRAYS)

@@ -1,0 +1,161 @@
+"""What pages tell the reader to type is typed: commands in the order of each page, its Python, its notebooks.
+
+The bundled simulated rig is replaced by a small one, so that a scan takes a second. The working directory has the files
+that pages take for granted (`my-rig.yaml`, `cube.npy`, ...); all others must come from earlier commands of the page.
+"""
+
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from drivers.registry import SLOTS, kinds, lookup
+from rig.config.bundled import BUNDLED
+from tests.system.conftest import Rig
+from tests.system.small_rig import HEIGHT, WIDTH, calibration, config
+from tests.unit.test_docs import NOTEBOOKS, PAGES, ROOT
+
+NOT_RUN: Mapping[str, str] = {
+    r"rig calibrate (?!pixels)": "needs pictures of a board, and minutes: tests/system/calibrate",
+    r"rig (import|reconstruct runs/)": "needs files of other cameras: tests/system/cli/test_cli_exchange.py",
+    r"rig tradeoff .*--(repeat|lines)|rig scan runs/": "takes minutes: tests/system/cli/test_cli_tradeoff.py",
+    r"rig (scan lab|replay taken)": "no devices are here, emulated ones take real time: tests/system/test_lab_emulated.py",
+    r"rig .* /data/": "names folders of other computers",
+    r"rig (bench|warmup)": "measures this machine, for a minute: tests/system/cli/test_cli_commands.py",
+    r"rig (stream|view|align|demo)\b|rig .* --view\b": "goes on until it is stopped: tests of its own",
+    r"rig record|rig scan .*--record-on-request": "needs a scan that goes on: tests/system/scans",
+    r"rig devices": "depends on what is attached: tests/system/test_doctor.py",
+    r"rig .*(\.\.\.|\b[A-Z][A-Z-]*\b)": "leaves a value open",
+}
+"""Commands that are not run, by a pattern of their beginning, and why. All are parsed (tests/unit/test_docs.py)."""
+PYTHON = {"own-sensor.md"}
+"""Pages whose Python is run here, block after block; other tests run that of one-device.md and python.md."""
+COMMAND = re.compile(r"(?:then: )?(rig(?: .*?)?)(?: > (\S+))?")
+Block = tuple[str, str]
+
+markdown = [page for page in PAGES if page.suffix == ".md"]
+pages = pytest.mark.parametrize("page", markdown, ids=[str(page.relative_to(ROOT)) for page in markdown])
+
+
+def blocks(page: Path) -> list[Block]:
+    """The blocks of code of a page: language and text."""
+    found: list[Block] = []
+    language, lines = None, []
+    for line in page.read_text(encoding="utf-8").splitlines():
+        fence = re.fullmatch(r" *```(\w*)", line)
+        if fence and language is None:
+            language, lines = fence[1], []
+        elif fence:
+            found.append((language or "", "\n".join(lines)))
+            language = None
+        elif language is not None:
+            lines.append(line)
+    return found
+
+
+def commands_of(page: Path) -> list[tuple[str, str | None]]:
+    """The commands in the blocks of a page, each with the file to which it is redirected."""
+    parts = [
+        part.strip()
+        for language, text in blocks(page)
+        if language == ""
+        for line in text.splitlines()
+        for part in re.split(r"&&|;|#", line)
+    ]
+    return [(found[1], found[2]) for part in parts if (found := COMMAND.fullmatch(part))]
+
+
+def reason(command: str) -> str | None:
+    """Why a command is not run; None if it is."""
+    return next((why for pattern, why in NOT_RUN.items() if re.match(pattern, command)), None)
+
+
+def write(path: Path, content: object) -> None:
+    """Write a YAML file."""
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+
+@pytest.fixture
+def typed(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[
+    [str, str | None], int
+]:  # fmt: skip
+    """Type a command in a folder with what pages take for granted, and with a small rig as the bundled one."""
+    bundled = Path(shutil.copytree(BUNDLED, tmp_path / "config"))
+    small = config() | {"name": "simulated", "calibration": "small.yaml", "estimate": {"estimator": "auto"}}
+    small["world"] |= {"geometry": "./small.yaml", "scene": "street"}
+    small["scan"] |= {"command_range": [-0.5, 0.5]}
+    write(bundled / "small.yaml", calibration())
+    write(bundled / "simulated.yaml", small)
+    monkeypatch.setattr("rig.config.files.BUNDLED", bundled)
+
+    here = Path.cwd()
+    for name in ("calibration.yaml", "small.yaml"):
+        write(here / name, calibration())
+    for name in ("my-rig.yaml", "lab.yaml"):
+        write(here / name, small)
+    write(here / "plan.yaml", {"columns": 20, "exposures": 2, "frame_rate": "100 kHz", "depth_range": ["1 m", "8 m"]})
+    frames = np.random.default_rng(1).random((40, HEIGHT, WIDTH)) < 0.02
+    np.save(here / "cube.npy", np.packbits(frames, axis=2))
+
+    def run(command: str, into: str | None) -> int:
+        ran = rig(*shlex.split(command)[1:])
+        assert ran.problems == [], command
+        if into is not None and "lab" not in command:  # that of a real rig, whose devices are not here
+            Path(into).write_text(ran.out, encoding="utf-8")
+        return ran.code
+
+    return run
+
+
+@pages
+def test_commands_of_a_page_do_what_it_says(page: Path, typed: Callable[[str, str | None], int]) -> None:
+    for command, into in commands_of(page):
+        if reason(command) is None:
+            assert typed(command, into) == 0, command
+
+
+def test_most_commands_of_pages_are_run_and_every_reason_not_to_is_needed() -> None:
+    named = {command for page in markdown for command, _ in commands_of(page)}
+    assert sum(reason(command) is None for command in named) > 30
+    assert [pattern for pattern in NOT_RUN if not any(re.match(pattern, command) for command in named)] == []
+
+
+@pytest.mark.parametrize("name", sorted(PYTHON))
+def test_python_of_a_page_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = next(page for page in markdown if page.name == name)
+    place: dict[str, object] = {}
+    for language, text in blocks(page):
+        if language == "python":
+            exec(compile(text, str(page), "exec"), place)
+
+
+@pages
+def test_python_and_yaml_of_a_page_are_what_the_program_takes(page: Path) -> None:
+    for language, text in blocks(page):
+        if language == "python":
+            compile(text, str(page), "exec")
+        content = yaml.safe_load(text) if language == "yaml" else None
+        for slot in set(SLOTS) & set(content or ()):
+            section = content[slot]
+            if "kind" in section:
+                assert section["kind"] in kinds(slot) or page.name == "plugin.md", section
+                if section["kind"] in kinds(slot):
+                    lookup(slot, section["kind"]).config.model_validate(section)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[notebook.stem for notebook in NOTEBOOKS])
+def test_a_notebook_runs_and_lies_there_without_outputs(notebook: Path) -> None:
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    place: dict[str, object] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+            exec(compile("".join(cell["source"]), str(notebook), "exec"), place)
