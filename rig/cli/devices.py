@@ -29,7 +29,8 @@ def doctor_command(
     out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
 ) -> Answer:
     """Open everything, look at the stream with the gate low, and say whether a scan could run."""
-    findings = api.doctor(config, out=out)
+    with progress():
+        findings = api.doctor(config, out=out)
     could_scan = all(one.ok for one in findings)
     lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
     content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
@@ -69,7 +70,8 @@ def align_command(
 def devices_command() -> Answer:
     """List what is attached: USB devices that a driver knows, NI cards, Ether Dreams and Pulse Streamers on the
     network, and serial ports."""
-    found = api.devices()
+    with progress(compiles=False):
+        found = api.devices()
     lines = [f"{one.address:<32}{one.what}" for one in found]
     said = "\n".join(lines or ["no USB device, card, network device or serial port that a driver knows is attached"])
     return Answer({"devices": [asdict(one) for one in found]}, lambda: print(said))
@@ -77,14 +79,17 @@ def devices_command() -> Answer:
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
     """Set the gate low and switch the laser's emission off for good."""
-    for line in api.laser_off(config):
+    with progress():
+        done = api.laser_off(config)
+    for line in done:
         print(line)
     return 0
 
 
 def check_command(config: ConfigArgument = "simulated") -> Answer:
     """Say whether a config is valid and the files that it names can be read; list all problems at once."""
-    checked = api.check_config(config)
+    with progress():
+        checked = api.check_config(config)
     content = {"config": config, "name": checked.name, "valid": True}
     return Answer(content, lambda: print(f"{config}: valid, rig '{checked.name}'"))
 
@@ -101,7 +106,9 @@ def schema_command() -> int:
     """Print the JSON schema of a config, for editors."""
     from rig.config.files import config_schema
 
-    print_json(config_schema())
+    with progress():
+        schema = config_schema()
+    print_json(schema)
     return 0
 
 

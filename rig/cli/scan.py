@@ -58,10 +58,13 @@ def scan_command(
     if dry_run:
         spaces: list[Space] = []
         estimator: list[str] = []
-        plan = api.plan_scan(rig, request, on_space=spaces.append, on_estimator=estimator.append)
+        with progress():
+            plan = api.plan_scan(rig, request, on_space=spaces.append, on_estimator=estimator.append)
         return _of_plan(plan, estimator[0], spaces[0] if spaces else None)
     if view:
         show_page()
+    if request.record_on_request:
+        say(f"nothing is recorded yet: 'rig record on {request.out}' begins a part, 'rig record off' ends it")
     with progress():
         result = api.scan(rig, request, on_space=say_space)
     return report(result)
@@ -158,7 +161,8 @@ def effects_command(
     """
     chosen = config if config_option is None else config_option
     if row is not None or column is not None:
-        flux = api.flux_row(chosen, scene=scene, row=row, column=column)
+        with progress():
+            flux = api.flux_row(chosen, scene=scene, row=row, column=column)
         return Answer(flux, lambda: tables.flux_table(flux))
     with progress():
         effects = api.effects(chosen, scene=scene, trials=trials)

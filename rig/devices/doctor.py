@@ -37,6 +37,7 @@ from rig.devices.prepare import prepare, require_memory
 from rig.errors import DevicesError, RigError
 from rig.plan.gate_pulses import sync_program
 from rig.plan.scan_plan import MAX_CLOCK_ERROR, ScanPlan
+from rig.progress import tell_stage
 
 MOST_JITTER = 0.05
 """Largest standard deviation of the line markers, in columns, with which frames can be bound to columns."""
@@ -159,6 +160,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
             require_memory(rig, plan)
             rig.sync.program(*sync_program(plan, len(plan.legs)))
             findings.append(_plan(plan))
+            tell_stage("looking at the stream")
             findings += _frames(look(rig, plan, timing.stride), plan)
             if (fault := rig.scanner.status.fault) is not None:
                 findings.append(Finding("scanner", False, f"ended on the way: {fault}"))
@@ -166,6 +168,7 @@ def examine(config: RigConfig, folder: Path) -> list[Finding]:
                 findings.append(Finding("memory", True, f"at most {digits(most / 1e6)} MB waited in the SPAD"))
     except (RigError, DeviceError) as error:
         findings += [Finding("devices", False, line) for line in str(error).splitlines()]
+    tell_stage("writing to the disk")
     findings.append(_disk(folder))
     return findings
 
@@ -309,12 +312,14 @@ class Attached:
 def attached() -> list[Attached]:
     """List USB devices that a driver knows, NI cards that NI-DAQmx knows, Ether Dreams that broadcast, Pulse Streamers
     that answer, then serial ports. Opens nothing."""
+    tell_stage("looking at USB and cards")
     found = [
         Attached(one.address, f"{kind}: {one.product_name or wanted.label}", kind)
         for kind, wanted in KNOWN
         for one in attached_usb(wanted)
     ]
     found += [Attached(name, f"nidaq: {model}", "nidaq") for name, model in attached_cards()]
+    tell_stage("listening on the network")
     for address, heard in dict(broadcasts()).items():
         found.append(Attached(address, f"etherdream: MAC {heard.mac}, hardware {heard.hardware}", "etherdream"))
     for address, serial in dict(discover()).items():

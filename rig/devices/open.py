@@ -22,6 +22,7 @@ from drivers.transports.serial_port import configured_port
 from drivers.transports.tap import Tap, TapFile
 from rig.config.models import RigConfig
 from rig.errors import DevicesError, UsageError
+from rig.progress import tell_stage
 from rig.recording.cube import cube_columns
 
 GUARDED = ("laser", "sync")
@@ -151,6 +152,7 @@ def _open(config: RigConfig, seed: int, tap: TapFile | None, stack: ExitStack) -
         guard = stack.enter_context(Guard(**light, ports=surroundings.ports, tap=tap)) if light else None
         # Closing runs backwards: the gate goes low before the laser pauses, the mirror parks and the SPAD stops.
         for slot in DEVICES:
+            tell_stage("opening devices", note=slot)
             try:
                 if guard is not None and slot in light:
                     device: Any = guard.laser if slot == "laser" else guard.sync

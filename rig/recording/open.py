@@ -19,6 +19,7 @@ from rig.config.overrides import PathLike
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
 from rig.errors import DamagedRecordingError, UsageError
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
+from rig.progress import tell_stage
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
 from rig.run_folder.time_of_day import Anchor, read_anchors, utc_text
 
@@ -218,6 +219,7 @@ def info(run: PathLike) -> RecordingInfo:
     Raises UsageError if there is no recording, DamagedRecordingError if no block can be read.
     """
     folder = Path(run)
+    tell_stage("reading the index")
     recording = open_recording(folder)
     manifest, trouble = manifest_or_none(folder)
     spans = map_spans(recording, manifest)

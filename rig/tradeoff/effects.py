@@ -18,7 +18,7 @@ from rig.errors import PlanError, UsageError
 from rig.geometry.line_grid import line_grid
 from rig.geometry.stripe_table import MISSING_PX, charged_errors
 from rig.plan.scan_plan import column_command
-from rig.progress import Progress, part
+from rig.progress import Progress, part, tell_stage
 from rig.requests import RunRequest
 from rig.run_folder.summary import MapTally
 from rig.scan.run import Run
@@ -137,6 +137,7 @@ def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int |
         raise UsageError("the flux is that of one image row at one column of the scan; give both `row` and `column`")
     config = configure(config, scene=scene)
     scan = config.scan
+    tell_stage("making the scene")
     with open_world(config) as (world, power_w):
         rows, width = world.size
         problems = [

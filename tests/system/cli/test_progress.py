@@ -1,13 +1,19 @@
 """What commands say of their progress, what they begin with, and what they refuse before they begin."""
 
+import inspect
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
 from rig import api
+from rig.cli import bench, calibrate, devices, recordings, scan, view
+from rig.cli.command import Commands
 from rig.cli.tables import effects_table
 from rig.scan.monitor import ScanProgress
 from tests.system.conftest import Rig
@@ -38,6 +44,10 @@ def test_a_scan_counts_to_all_of_its_plan_s_frames_and_no_further(small: Path) -
             {"scan 1 of 1", "finding what the"},
         ),
         (("calibrate", "sync", "RIG", "--out", "out"), {"speed 1 of 3", "speed 3 of 3"}),
+        (("scan", "RIG", "--dry-run"), {"opening devices"}),
+        (("doctor", "RIG"), {"opening devices", "looking at the stream", "writing to the disk"}),
+        (("effects", "RIG", "--row", "3", "--column", "4"), {"making the scene"}),
+        (("info", "RUN"), {"reading the index"}),
     ],
     ids=lambda part: part[0] if isinstance(part, tuple) else None,
 )
@@ -51,6 +61,38 @@ def test_every_long_command_names_its_stages_on_stderr_and_prints_one_object(
     said = [line.split(" ", 1)[1] for line in lines]
     assert all(any(line.startswith(stage) for line in said) for stage in stages), said
     assert len(said) == len(set(said)) < 100
+
+
+SILENT = {
+    "scenes": "reads small files",
+    "config show": "reads one file",
+    "record": "asks a running scan",
+    "view": "says its address and stays",
+    "stream": "says its address and stays",
+}
+"""Commands that are done at once, or never done, and so show no progress."""
+
+
+def module_commands(module: ModuleType) -> Commands:
+    """All commands of a module of `rig.cli`."""
+    return {**getattr(module, "SCENES", {}), **module.COMMANDS}
+
+
+def each_command(commands: Commands, before: str = "") -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Every command with its full name."""
+    for name, given in commands.items():
+        if isinstance(given, tuple):
+            yield from each_command(given[1], f"{before}{name} ")
+        else:
+            yield f"{before}{name}", given
+
+
+def test_every_command_shows_its_progress_or_is_known_to_need_none() -> None:
+    modules = bench, calibrate, devices, recordings, scan, view
+    found = dict(each_command({name: given for module in modules for name, given in module_commands(module).items()}))
+    assert SILENT.keys() <= found.keys()
+    silent = {name for name, command in found.items() if "with progress(" not in inspect.getsource(command)}
+    assert silent == SILENT.keys()
 
 
 @pytest.mark.parametrize("command", ["planes", "camera"])
