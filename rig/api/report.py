@@ -44,7 +44,8 @@ def report(
     the file cannot be written.
     """
     folder, second = Path(run), None if other is None else Path(other)
-    kind, missing = _kind(folder), ()
+    kind = _kind(folder)
+    missing: tuple[str, ...] = ()
     for what, given in (("`other`", second), ("`map`", map)):
         if given is not None and kind != "run":
             raise UsageError(f"{what} is {given}, but {folder} is a {kind}; leave it out, or name a run")

@@ -14,13 +14,14 @@ from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, UsageError
 from rig.exchange import hdf5, pictures
 from rig.exchange.npy import FrameLog, MapFiles, write_npy
-from rig.exchange.pictures import VIEWS, Picture, View
+from rig.exchange.pictures import VIEWS, View
 from rig.progress import Progress, counted
 from rig.recording.inputs import read_model, reconstruct_line
 from rig.recording.open import SEGMENTS, require_recording
 from rig.requests import ExportRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import read_manifest
+from rig.run_folder.pictures import Picture
 
 EXPORT_KINDS: Final = ("npy", "hdf5", "ply", "png", "mp4")
 PICTURE_KINDS: Final = ("png", "mp4")

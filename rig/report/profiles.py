@@ -36,7 +36,8 @@ SURE: Final = 0.5
 def row_profiles(runs: Sequence[RunFacts]) -> str:
     """HTML of the profiles of all shown rows of one or two runs; empty if there is nothing to show."""
     rows = next((run.rows for run in runs if run.rows), ())
-    parts, shown = [], {}
+    parts: list[str] = []
+    shown: dict[str, Series] = {}
     for row in rows:
         panels = [panel for panel in (_depth(runs, row), _light(runs, row)) if panel is not None]
         for run in runs:
@@ -54,7 +55,7 @@ def _name(runs: Sequence[RunFacts], run: RunFacts, what: str) -> str:
 
 def _depth(runs: Sequence[RunFacts], row: int) -> Panel | None:
     """Depth along a row, with the truth where it is known."""
-    series = []
+    series: list[Series] = []
     for run, colour in zip(runs, RUN_COLOURS, strict=False):
         true_m = run.truth.get("depth_m")
         if not series and true_m is not None and row < len(true_m):
@@ -141,7 +142,7 @@ def mean_profile(counted: RowCounts, stripe: Mapping[str, Float32], row: int, co
         if to.start < to.stop:
             ones[to] += counts[c, of]
             exposures[to] += counted.frames[c]
-    return np.divide(ones, exposures, out=np.full(width, np.nan), where=exposures > 0)
+    return np.asarray(np.divide(ones, exposures, out=np.full(width, np.nan), where=exposures > 0))
 
 
 def _broken(x: NDArray[np.floating], y: NDArray[np.floating]) -> list[Point]:

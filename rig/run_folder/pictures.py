@@ -186,7 +186,7 @@ def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
     import cv2
 
     level = _without_window_steps(2 * np.sqrt(intensity.astype(np.float32) + 0.375))
-    level = cv2.GaussianBlur(cv2.medianBlur(level, 3), (0, 0), 0.8)
+    level = np.asarray(cv2.GaussianBlur(cv2.medianBlur(level, 3), (0, 0), 0.8), np.float32)
     rows, width = level.shape
     small = max(1, width // _SHRINK), max(1, rows // _SHRINK)
     sigma = max(small) / _AROUND
@@ -196,7 +196,7 @@ def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
         return np.asarray(cv2.resize(shrunk, (width, rows), interpolation=cv2.INTER_LINEAR), np.float32)
 
     off = level - around(level)
-    local = off / np.maximum(np.sqrt(around(off * off)), _LEAST_SPREAD)
+    local = np.asarray(off / np.maximum(np.sqrt(around(off * off)), np.float32(_LEAST_SPREAD)), np.float32)
     both = _LOCAL_SHARE * _stretched(local) + (1 - _LOCAL_SHARE) * _stretched(level)
     return np.asarray(np.round(255 * both), np.uint8)
 
@@ -204,7 +204,7 @@ def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
 def _stretched(level: NDArray[np.float32]) -> NDArray[np.float32]:
     """Levels as 0 to 1 between their 1st and 99.5th percentile."""
     low, high = np.percentile(level[::2, ::2], [1, 99.5])  # a quarter of the pixels tells, in a quarter of the time
-    return np.clip((level - low) / max(float(high - low), _LEAST_SPREAD), 0, 1)
+    return np.asarray(np.clip((level - low) / max(float(high - low), _LEAST_SPREAD), 0, 1), np.float32)
 
 
 def beside(left: Picture, right: Picture) -> Picture:
