@@ -43,14 +43,15 @@ class LiveNews:
 
 
 class LiveSource:
-    """Follows the newest running scan. state: of the run that was followed last. slot: that run; None before any."""
+    """Follows the newest running scan. state: of the run that was followed last. slot: that run; None before any. rays:
+    of its camera, None if it is not calibrated."""
 
     def __init__(self) -> None:
         self.state = LiveState.WAITING
         self.slot: RunningSlot | None = None
         self._reader: SlotReader | None = None
         self._numbers: dict[str, int] = {}
-        self._rays: tuple[Float32, Float32] | None = None
+        self.rays: tuple[Float32, Float32] | None = None
         self._min_confidence = 0.5
         self._row: Value | None = None
         self._looked_s = -LOOK_S
@@ -115,7 +116,7 @@ class LiveSource:
         except (OSError, UsageError):  # it has just ended
             return
         self.slot, self.state = found, LiveState.LIVE
-        self._numbers, self._rays, self._row = {}, None, None
+        self._numbers, self.rays, self._row = {}, None, None
 
     def _detach(self) -> None:
         if self._reader is not None:
@@ -124,7 +125,10 @@ class LiveSource:
 
     def _new(self, section: str) -> Value | None:
         assert self._reader is not None, "asked for while attached"
-        value = self._reader.read(section, self._numbers.get(section, 0))
+        try:
+            value = self._reader.read(section, self._numbers.get(section, 0))
+        except KeyError:  # a run of another version
+            return None
         if value is not None:
             self._numbers[section] = value.number
         return value
@@ -133,7 +137,7 @@ class LiveSource:
         setup, status, figures = self._new("setup"), self._new("status"), self._new("figures")
         if setup is not None:
             u, v = setup.arrays.get("u"), setup.arrays.get("v")
-            self._rays = None if u is None or v is None else (u, v)
+            self.rays = None if u is None or v is None else (u, v)
             estimate = (setup.header.get("config") or {}).get("estimate") or {}
             self._min_confidence = float(estimate.get("min_confidence", 0.5))
         found, frame = (self._new("map"), self._new("frame")) if maps else (None, None)
@@ -152,7 +156,7 @@ class LiveSource:
         arrays, header = value.arrays, value.header
         stripe = {name.removeprefix(_STRIPE): array for name, array in arrays.items() if name.startswith(_STRIPE)}
         depth_m = arrays["depth_m"]
-        calibrated = self._rays is not None
+        calibrated = self.rays is not None
         return ShownMap(
             int(header["index"]),
             stripe,
@@ -161,7 +165,7 @@ class LiveSource:
             arrays.get("depth_sd_m") if calibrated else None,
             arrays["intensity"].astype(np.float32),
             None,
-            self._rays,
+            self.rays,
             {**header, "min_confidence": self._min_confidence},
         )
 

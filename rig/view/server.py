@@ -37,6 +37,8 @@ DATA: Final = "/data"
 POINTS: Final = "/points.ply"
 _CAMERA_MESSAGES_PER_S: Final = 200.0
 """viser's client sends its camera fifty times a second while somebody turns it."""
+_CLOSE_S: Final = 1.0
+"""Longest wait for a client to agree that its web socket is closed: one that floods does not."""
 _ONLY_POINTS: Final = b"<style>body *:not(:has(canvas)):not(canvas){display:none!important}</style>"
 """Hides viser's own panels; only the canvas is left."""
 _ON_TO_THE_PAGE: Final = b'<!doctype html><meta http-equiv="refresh" content="0;url=/">'
@@ -103,6 +105,7 @@ class ViewServer:
                 "process_request": partial(self._answer, options["process_request"]),
                 "max_size": MOST_MESSAGE_BYTES,
                 "compression": None,
+                "close_timeout": _CLOSE_S,
                 "logger": _silent(),
                 "server_header": None,
             }

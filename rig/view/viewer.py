@@ -21,6 +21,7 @@ from rig.config.estimators import estimator_names
 from rig.errors import RigError, UsageError
 from rig.recording.map_rows import RowCounts
 from rig.requests import ViewRequest
+from rig.simd import Float32
 from rig.view import health
 from rig.view.access import Access
 from rig.view.estimation import Estimated, Estimation, EstimationRequest
@@ -38,6 +39,8 @@ _BEAT_S: Final = 0.1
 _FOG_KEPT: Final = 600
 _NICE: Final = 10
 """Priority below that of a scan on the same computer."""
+_ASPECT: Final = 1.3
+"""Width over height of the point cloud's part of the page, about."""
 _PICTURES: Final = ("depth", "counts", "confidence")
 _NO_SCAN: Final = "No scan of yours is running on this computer. This page waits for one: rig scan"
 _STATES: Final = {
@@ -203,12 +206,14 @@ class _Shows:
             self._answered[wish.page] = state
             self.pages.answer(wish.page, "row", self._row_answer(wish.values["row"], wish.values["x"]))
 
-    def look_from_camera(self, distance_m: float, half_height: float = 0.5) -> None:
-        """Begin new pages with the view of the camera, turning about a point at this distance. half_height: tangent of
-        half the angle that is seen."""
+    def look_from_camera(self, distance_m: float, rays: tuple[Float32, Float32] | None = None) -> None:
+        """Begin new pages with the view of the camera, turning about a point at this distance, wide enough for rays."""
+        widest = 0.5
+        if rays is not None and np.isfinite(rays[0]).any():
+            widest = max(float(np.nanmax(np.abs(rays[1]))), float(np.nanmax(np.abs(rays[0]))) / _ASPECT)
         camera = self.server.viser.initial_camera
         camera.position, camera.look_at = (0.0, 0.0, -0.1 * distance_m), (0.0, 0.0, distance_m)
-        camera.up, camera.fov = (0.0, -1.0, 0.0), 2 * float(np.arctan(half_height))
+        camera.up, camera.fov = (0.0, -1.0, 0.0), 2 * float(np.arctan(widest))
 
     def _row_answer(self, row: int, x: int) -> dict[str, Any]:
         shown = self._shown
@@ -294,7 +299,7 @@ class _ShowsLive(_Shows):
             self._tell_setup({}, self._source.slot.name)
         if news.setup is not None:
             near_m, far_m = news.setup.get("depth_range_m") or (1.0, 9.0)
-            self.look_from_camera(0.5 * (near_m + far_m))
+            self.look_from_camera(0.5 * (near_m + far_m), self._source.rays)
             self._tell_setup(news.setup, str(news.setup.get("name") or ""))
         if news.status is not None:
             self._figures = health.of_status(news.status)
@@ -407,7 +412,7 @@ class _ShowsRun(_Shows):
         if not self._source.recorded and not self._shown.stripe:
             self._label = f"sum {number} of imported frames"
         if self._limits is None and self._shown.depth_m is not None and np.isfinite(self._shown.depth_m).any():
-            self.look_from_camera(float(np.nanmedian(self._shown.depth_m)))
+            self.look_from_camera(float(np.nanmedian(self._shown.depth_m)), self._shown.rays)
         self.tell_map()
 
     def _begin(self, estimator: str) -> None:
@@ -453,11 +458,12 @@ class _ShowsRun(_Shows):
 
 
 def _pixel_m(shown: ShownMap) -> float:
-    """Distance between the points of neighbouring pixels at the map's usual depth, in metres."""
+    """Size of points in metres: the distance of neighbouring pixels on the nearer surfaces. Larger ones would hide what
+    is behind them."""
     assert shown.depth_m is not None, "it has points"
     assert shown.rays is not None, "it has points"
     step = float(np.nanmedian(np.abs(np.diff(shown.rays[0], axis=1))))
-    return 1.2 * float(np.nanmedian(shown.depth_m)) * (step if np.isfinite(step) else 2e-3)
+    return 1.2 * float(np.nanpercentile(shown.depth_m, 40)) * (step if np.isfinite(step) else 2e-3)
 
 
 def _legend(legend: Legend | None) -> dict[str, Any]:
