@@ -19,6 +19,7 @@ from spadrig.names import require_own_names
 require_own_names()  # here too: another package `rig` may have overwritten only `rig/__init__.py`
 
 from rig.api.demo import Demonstration, demonstrate
+from rig.api.example import ExampleRecording, example_recording
 from rig.api.quality import quality
 from rig.api.record import RecordState, record
 from rig.api.report import ReportResult, report
@@ -71,6 +72,7 @@ __all__ = [
     "CheckRequest",
     "Config",
     "Demonstration",
+    "ExampleRecording",
     "OnMap",
     "PathLike",
     "PixelsRequest",
@@ -104,6 +106,7 @@ __all__ = [
     "devices",
     "doctor",
     "effects",
+    "example_recording",
     "export_run",
     "flux_row",
     "import_frames",

@@ -51,6 +51,18 @@ def repair_command(run: RunArgument) -> Answer:
     return Answer(asdict(made), show, made.after.exit_code)
 
 
+def example_command(
+    out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty")] = Path("example"),
+) -> Answer:
+    """Make a small recording to try other commands on: one map of the bundled rig 'small', the same for everybody."""
+    with progress():
+        made = api.example_recording(out)
+    if not made.as_published:
+        say("warning: this computer rounds differently, so its frames are not the bits of the published recording")
+    said = f"{made.folder}: {made.frames} frames, {made.bytes / 1e6:.2f} MB, sha256 of the frames {made.sha256}"
+    return Answer(made.as_json(), lambda: print(said))
+
+
 def info_command(run: RunArgument) -> Answer:
     """Describe what a recording holds."""
     with progress(compiles=False):
@@ -296,6 +308,7 @@ def _follow(pace: "Pace", handle: int) -> None:
 
 
 COMMANDS: Commands = {
+    "example": example_command,
     "runs": runs_command,
     "report": report_command,
     "quality": quality_command,

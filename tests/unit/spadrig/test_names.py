@@ -66,7 +66,7 @@ def test_a_labs_own_config_folder_and_module_do_no_harm(tmp_path: Path) -> None:
     (tmp_path / "config" / "lab.yaml").write_text("nothing of ours")
     look = "import config; from rig.config.bundled import bundled_rigs; print(bundled_rigs()[-1].name, config.__file__)"
     ended = python("-c", look, work=tmp_path)
-    assert (ended.stderr, ended.stdout) == ("", f"simulated-4-lines {tmp_path / 'config' / '__init__.py'}\n")
+    assert (ended.stderr, ended.stdout) == ("", f"small {tmp_path / 'config' / '__init__.py'}\n")
 
 
 def test_the_command_names_a_foreign_rig_on_the_path_in_one_line_and_as_json(tmp_path: Path) -> None:
