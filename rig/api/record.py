@@ -80,7 +80,7 @@ def record(on: bool | None, run: PathLike | None = None, *, runs: PathLike = "ru
     while time.monotonic() < ends:
         time.sleep(LOOK_S)
         now = _state(folder)
-        if now.on == on and (now.recording == on or now.parts > before.parts or not is_held(folder / STATE)):
+        if now.on == on and (now.recording == on or now.parts > before.parts or not _goes_on(folder)):
             return now
     raise UsageError(
         f"{folder} did not begin or end its part within {ANSWER_S:g} s, but may do so yet; do its frames come? "
@@ -113,14 +113,18 @@ def _state(folder: Path) -> RecordState:
         return RecordState(folder, False, False, 0)
 
 
+def _goes_on(folder: Path) -> bool:
+    return (folder / STATE).exists() if os.name == "nt" else is_held(folder / STATE)  # files have no locks on Windows
+
+
 def _require_running(folder: Path) -> None:
-    if not is_held(folder / STATE):
+    if not _goes_on(folder):
         what = "is no scan that goes on with `record_on_request`" if folder.is_dir() else "does not exist"
         raise UsageError(f"{folder} {what}; name the folder of one")
 
 
 def _only_one(runs: Path) -> Path:
-    going = sorted(file.parent for file in runs.glob(f"*/{STATE}") if is_held(file))
+    going = sorted(file.parent for file in runs.glob(f"*/{STATE}") if _goes_on(file.parent))
     if len(going) == 1:
         return going[0]
     found = f"{len(going)} go on in {runs}: {', '.join(map(str, going))}" if going else f"none goes on in {runs}"

@@ -60,7 +60,16 @@ def _request_of(folder: Path, manifest: dict[str, Any]) -> ScanRequest:
     known = {field.name for field in fields(ScanRequest)} - {*_IN_CONFIG, *_OF_THE_RUN}
     older = {name: manifest[name] for name in ("seed", "maps", "on_overload") if manifest.get(name) is not None}
     asked = {**older, **{name: value for name, value in noted.items() if name in known}}
-    plain = {"record": bool, "accept_calibration": bool, "seed": int, "maps": int, "save": str, "on_overload": str}
+    plain = {
+        "record_on_request": bool,
+        "before": str,
+        "record": bool,
+        "accept_calibration": bool,
+        "seed": int,
+        "maps": int,
+        "save": str,
+        "on_overload": str,
+    }
     for name, kind in plain.items():
         if asked.get(name) is not None and type(asked[name]) is not kind:
             raise UsageError(f"{folder / MANIFEST}: request.{name} is {asked[name]!r}; scan anew, without `like`")

@@ -6,7 +6,7 @@ computer asked the SPAD to start, and its exposure was over when its block arriv
 
 Blocks arrive late by varying times, never early. The line below all arrivals that lies closest to them has the
 difference of the two clocks as its slope (Moon, Skelly and Towsley, INFOCOM 1999: one edge of the lower convex hull).
-It is used from `LEAST_SPAN_S` of frames on; before, the clocks may differ by `CLOCK_TOLERANCE`.
+It is used from `LEAST_SPAN_S` and `LEAST_ARRIVALS` on; before, the clocks may differ by `CLOCK_TOLERANCE`.
 
 Arrivals are noted by the host's monotonic clock, which no step of UTC changes; UTC is read with it at the beginning and
 at the end. A step between the two is stated and added to the uncertainty. How far the host's UTC itself may be off is
@@ -18,7 +18,7 @@ import sys
 import time
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final, Literal, NamedTuple
 
@@ -33,6 +33,10 @@ CLOCK_TOLERANCE: Final = 1e-4
 """Largest difference of the rates of two clocks that are not compared: crystals of 50 ppm each."""
 LEAST_SPAN_S: Final = 10.0
 """Seconds of frames from which on the rates are compared: arrivals scatter by milliseconds."""
+LEAST_ARRIVALS: Final = 64
+"""Arrivals from which on the rates are compared: among fewer, few may be quick."""
+_SLOPE_DELAYS: Final = 2.0
+"""Median delays by which the two quickest arrivals may differ, as far as the slope between them goes."""
 MOST_ARRIVALS: Final = 128
 """Arrivals kept of a start. Where there are more, the earlier of two neighbours is kept."""
 STEP_S: Final = 1e-3
@@ -118,6 +122,8 @@ class StartTimes:
         self.run_id: int | None = None
         self.pairs = 0
         self._arrivals: list[Arrival] = []
+        self._known: tuple[int, Anchor | None] = 0, None
+        """The anchor that was found by so many arrivals."""
         self._every, self._in_turn = 1, 0
 
     def ask(self) -> None:
@@ -147,35 +153,44 @@ class StartTimes:
 
     def anchor(self, scale: Scale, host: HostReading, step_s: float) -> Anchor | None:
         """The anchor by all arrivals so far; None before the first. host, step_s: UTC, and its step meanwhile."""
-        arrivals, timing = self._arrivals, self._timing
+        pairs, known = self._known
+        if pairs != self.pairs:
+            pairs = self.pairs
+            known = self._find(scale, host, self._arrivals)
+            self._known = pairs, known
+        if known is None or known.uncertainty_s is None:
+            return known
+        return replace(known, uncertainty_s=known.uncertainty_s + abs(step_s))
+
+    def _find(self, scale: Scale, host: HostReading, arrivals: Sequence[Arrival]) -> Anchor | None:
         if not arrivals:
             return None
-        tick_s, first = 1 / timing.tick_hz, arrivals[0]
+        timing, first = self._timing, arrivals[0]
+        tick_hz = float(timing.tick_hz)
         zero = first.tick - first.frame * timing.frame_period_ticks
         # Latest moments at which frame 0 may have begun, by device time of the frame that arrived, both in seconds.
-        exposure_s = float(timing.exposure_ticks * tick_s)
-        since_s = [float((each.tick - zero) * tick_s) for each in arrivals]
+        exposure_s = timing.exposure_ticks / tick_hz
+        since_s = [(each.tick - zero) / tick_hz for each in arrivals]
         late_s = [
             (each.at_ns - self.asked_ns) / NS - since - exposure_s
             for each, since in zip(arrivals, since_s, strict=True)
         ]
         offset_s, rate, rate_uncertainty = (0.0, 0.0, 0.0) if scale == "virtual" else line_below(since_s, late_s)
         most_s = max(0.0, offset_s)
-        uncertainty_s = most_s / 2 + host.within_ns / NS + abs(step_s)
         return Anchor(
             run_id=self.run_id or 0,
             tick=zero,
             utc_ns=host.at(self.asked_ns) + round(most_s / 2 * NS),
-            uncertainty_s=None if scale == "virtual" else uncertainty_s,
+            uncertainty_s=None if scale == "virtual" else most_s / 2 + host.within_ns / NS,
             rate_error=rate,
             rate_uncertainty=rate_uncertainty,
-            tick_hz=float(timing.tick_hz),
-            period_s=float(timing.frame_period_ticks * tick_s),
+            tick_hz=tick_hz,
+            period_s=timing.frame_period_ticks / tick_hz,
         )
 
     def _quicker(self, first: Arrival, second: Arrival) -> Arrival:
         """The one of two arrivals that came sooner after its exposure."""
-        apart_ns = (second.tick - first.tick) / self._timing.tick_hz * NS
+        apart_ns = (second.tick - first.tick) / float(self._timing.tick_hz) * NS
         return second if second.at_ns - first.at_ns < apart_ns else first
 
 
@@ -215,12 +230,11 @@ class TimeOfDay:
         """For each map (its number, first frame, last frame), `utc` of both and `utc_uncertainty_s`, as plain values;
         empty for a map without an anchor."""
         step_s = self._step_s()
-        anchors = [start.anchor(self.scale, self._host, step_s) for start in self._starts]
         first_maps = [start.first_map for start in self._starts]
         stamps = []
         for number, first, last in maps:
             at = bisect_right(first_maps, number) - 1
-            anchor = anchors[at] if at >= 0 else None
+            anchor = self._starts[at].anchor(self.scale, self._host, step_s) if at >= 0 else None
             stamps.append({} if anchor is None else map_content(anchor, first, last))
         return stamps
 
@@ -381,12 +395,12 @@ def line_below(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
     """The line below all points that lies closest to them: the most that its height at x = 0 may be, its slope, and how
     far that may be off.
 
-    x, y: seconds, x from 0 on, at least one point. Below `LEAST_SPAN_S` of x, or for a slope above `CLOCK_TOLERANCE`,
-    the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it may be off by half of the delays (their median) over the length
-    of the edge.
+    x, y: seconds, x from 0 on, at least one point. For fewer than `LEAST_ARRIVALS` points or less than `LEAST_SPAN_S`
+    of x, and for a slope above `CLOCK_TOLERANCE`, the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it may be off by
+    `_SLOPE_DELAYS` medians of the delays over the length of the edge.
     """
     span = max(x) - min(x)
-    if span >= LEAST_SPAN_S:
+    if span >= LEAST_SPAN_S and len(x) >= LEAST_ARRIVALS:
         hull = _lower_hull(sorted(zip(x, y, strict=True)))
         middle = sum(x) / len(x)
         at = min(max(bisect_right([point[0] for point in hull], middle), 1), len(hull) - 1)
@@ -394,7 +408,7 @@ def line_below(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
         slope = (y1 - y0) / (x1 - x0)
         if abs(slope) <= CLOCK_TOLERANCE:
             above = sorted(b - y0 - slope * (a - x0) for a, b in zip(x, y, strict=True))
-            uncertainty = min(CLOCK_TOLERANCE, above[len(above) // 2] / (x1 - x0))
+            uncertainty = min(CLOCK_TOLERANCE, _SLOPE_DELAYS * above[len(above) // 2] / (x1 - x0))
             return y0 - (slope - uncertainty) * x0, slope, uncertainty
     return min(b + CLOCK_TOLERANCE * a for a, b in zip(x, y, strict=True)), 0.0, CLOCK_TOLERANCE
 

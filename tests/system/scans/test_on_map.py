@@ -66,6 +66,7 @@ def test_settings_that_it_returns_are_those_of_the_next_scan(small: Path, tmp_pa
     assert (config.scan.columns, config.scan.power, request.maps) == (100, 0.02, 1)
 
 
+@pytest.mark.slow
 def test_changed_scans_are_recorded_one_by_one_and_played(small: Path, tmp_path: Path) -> None:
     def steer(seen: SeenMap) -> Mapping[str, Any] | None:
         return {"exposures": 6} if seen.number == 1 else None
@@ -141,6 +142,7 @@ def test_without_a_folder_nothing_is_written_and_the_results_are_all_there(small
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_the_python_of_the_page_runs(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a small rig in the place of the bundled one."""
     monkeypatch.chdir(tmp_path)

@@ -129,6 +129,7 @@ def test_a_run_of_parts_says_where_its_recordings_are(rig: Rig, parted: Path) ->
     assert [Path(entry["folder"]).name for entry in listed] == ["run", "whole"]
 
 
+@pytest.mark.slow
 def test_a_part_begins_as_long_before_as_was_asked_for_and_with_a_whole_sweep(small: Path, tmp_path: Path) -> None:
     """Without `before` it begins with the sweep under way; with a long one, at the first frame."""
     begins = {}
@@ -177,6 +178,7 @@ def test_a_wish_at_the_end_of_a_scan_is_met_out_of_the_ring(small: Path, tmp_pat
     assert api.verify(part.folder).exit_code == 0
 
 
+@pytest.mark.slow
 def test_learned_states_go_with_a_part(tmp_path: Path) -> None:
     """`likelihood` learns from map to map: the maps of a part come out as in the scan all the same."""
     content = small_rig.config() | {"estimate": {"estimator": "likelihood"}}
@@ -240,6 +242,7 @@ def test_a_disk_that_fails_ends_the_scan_as_with_any_recording(
     assert (tmp_path / "run/depth/000000.npy").exists()
 
 
+@pytest.mark.slow
 def test_a_part_that_a_killed_program_left_is_repaired(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

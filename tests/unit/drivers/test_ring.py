@@ -270,3 +270,19 @@ def test_under_threads_every_reader_gets_every_block_unspoilt(
         assert len(numbers) + watcher.skipped == n_blocks
     assert 1 <= ring.high_water <= slots
     assert len(ring._free) + len(ring._claimed) == slots
+
+
+def test_the_newest_frame_is_told_with_its_tick_and_a_block_without_frames_tells_none() -> None:
+    ring = BlockRing(3, STRIDE)
+    ring.reader("any")
+    assert ring.newest is None
+    memory = ring.claim(0)
+    assert memory is not None
+    records = np.zeros(3, FRAME_RECORD)
+    records["ticks"] = [0, 1000, 2000]
+    header = replace(GOLDEN_HEADER, first_frame=40, t0_ticks=70_000)
+    ring.publish(FrameBlock(header, records, np.zeros((3, 8, 8), np.uint8)))
+    assert ring.newest == (GOLDEN_HEADER.run_id, 42, 72_000)
+    assert ring.claim(0) is not None
+    ring.publish(FrameBlock(header, records[:0], np.zeros((0, 8, 8), np.uint8)))
+    assert ring.newest == (GOLDEN_HEADER.run_id, 42, 72_000)
