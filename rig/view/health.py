@@ -12,6 +12,10 @@ LEAST_FREE_BYTES: Final = 10e9
 """Free space below which a recording may soon end: a minute at 170 MB/s."""
 
 
+MOST_SATURATED: Final = 0.01
+"""Share of the line above which saturation blurs it."""
+
+
 class Figure(NamedTuple):
     """One line of the page. level: GOOD, WARN or BAD."""
 
@@ -62,12 +66,24 @@ def of_summary(summary: Mapping[str, Any], manifest: Mapping[str, Any]) -> list[
 
 
 def of_alignment(figures: Mapping[str, Any]) -> list[Figure]:
-    """Figures of an alignment, from the header of the section `figures`: each name has its unit at its end."""
-    return [
-        Figure(name.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value))
-        for name, value in figures.items()
-        if value is not None and not isinstance(value, Mapping | list)
-    ]
+    """Figures of an alignment, from the header of the section `figures`: those of `AlignFigures`, of rig align."""
+    width, seen, mean = (figures.get(name) for name in ("focus_px", "line_seen", "mean_rate"))
+    peak, in_scan, saturated = (figures.get(name) for name in ("peak_rate", "scan_peak_rate", "saturated_fraction"))
+    parts = ((name, figures.get(f"{name}_px")) for name in ("left", "middle", "right"))
+    thirds = ", ".join(f"{name} {'none' if px is None else f'{px:.2f}'}" for name, px in parts)
+    told = [Figure("line width", f"{width:.2f} px ({thirds})" if width else "no line stands out", _bad(not width))]
+    if seen is not None:
+        told.append(Figure("line seen", f"{seen:.0%} of rows and columns"))
+    if peak is not None:
+        later = "" if in_scan is None else f", in a scan {in_scan:.2f}"
+        told.append(Figure("peak rate", f"{peak:.2f} per exposure{later}"))
+    if saturated is not None:
+        told.append(Figure("saturated", f"{saturated:.1%} of the line", WARN if saturated > MOST_SATURATED else GOOD))
+    if mean is not None:
+        told.append(Figure("mean rate", f"{mean:.2g} per exposure and pixel"))
+    if figures.get("power_w") is not None and figures.get("limit_w") is not None:
+        told.append(Figure("laser power", f"{figures['power_w'] * 1e3:g} of {figures['limit_w'] * 1e3:g} mW"))
+    return told
 
 
 def fog_of(fog: Mapping[str, Any] | None) -> dict[str, float] | None:

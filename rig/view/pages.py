@@ -107,7 +107,7 @@ class _Page:
 
 
 class Pages:
-    """All open pages. `tell`, `answer` and `wishes` may be called from any thread; the rest is for the server's loop.
+    """All open pages. `tell`, `forget`, `answer` and `wishes` are for any thread, the rest for the server's loop.
 
     wake: set whenever there is a wish, and when a page comes or goes.
     """
@@ -133,6 +133,10 @@ class Pages:
     def tell(self, topic: str, content: Mapping[str, Any], picture: bytes = b"") -> None:
         """Tell all pages the newest value of a topic, and those that come later."""
         self._soon(self._tell, topic, message_bytes(topic, content, picture))
+
+    def forget(self) -> None:
+        """Tell later pages nothing of what was told so far."""
+        self._soon(self._newest.clear)
 
     def answer(self, page: int, topic: str, content: Mapping[str, Any]) -> None:
         """Tell one page; nothing happens if it is gone."""

@@ -256,6 +256,7 @@ class _ShowsLive(_Shows):
         self._source = source
         self._fog: list[dict[str, Any]] = []
         self._figures: list[health.Figure] = []
+        self._align: list[health.Figure] = []
         self._state: LiveState | None = None
         self._estimator = ""
         self._told_s = -np.inf
@@ -294,8 +295,9 @@ class _ShowsLive(_Shows):
     def _take(self, news: LiveNews, begun: bool) -> None:
         if begun and self._source.slot is not None:
             self._fog.clear()
-            self._shown, self._limits = None, None
-            self.say("")
+            self._align = []
+            self._shown, self._limits, self._state = None, None, None
+            self.pages.forget()
             self._tell_setup({}, self._source.slot.name)
         if news.setup is not None:
             near_m, far_m = news.setup.get("depth_range_m") or (1.0, 9.0)
@@ -304,9 +306,9 @@ class _ShowsLive(_Shows):
         if news.status is not None:
             self._figures = health.of_status(news.status)
         if news.figures is not None:
-            self._figures = [*health.of_alignment(news.figures), *self._figures]
+            self._align = health.of_alignment(news.figures)
         if news.status is not None or news.figures is not None:
-            self.pages.tell("health", {"figures": self._figures})
+            self.pages.tell("health", {"figures": [*self._align, *self._figures]})
         if news.profile is not None:
             self.pages.tell("profile", {"profile": np.nan_to_num(news.profile)})
         if news.map is not None:

@@ -167,7 +167,7 @@ def test_stop_asks_once_more_and_then_the_scan_is_told(live: Served, open_tab: O
         assert not slot.stop_requested
         tab.page.click("#do-stop")
         eventually(lambda: slot.stop_requested)
-        wait_for(tab, slot, "latest.notice.text.includes('asked to stop')")
+        wait_for(tab, slot, "latest.notice && latest.notice.text.includes('asked to stop')")
 
 
 def test_the_last_map_stays_when_the_scan_ends(live: Served, open_tab: Open) -> None:
@@ -221,11 +221,15 @@ def test_an_alignment_shows_its_frames_figures_and_profile(live: Served, open_ta
 
         def write() -> None:
             slot.write("frame", {"first_frame": 5, "frames": 16}, {"counts": np.ones((ROWS, WIDTH), np.uint16)})
-            slot.write("figures", {"focus_px": 1.25, "saturated_fraction": 0.5, "line": "x"}, {"profile": profile})
+            slot.write(
+                "figures", {"focus_px": 1.25, "saturated_fraction": 0.5, "mean_rate": 0.01}, {"profile": profile}
+            )
 
-        figures = "latest.health.figures.some(([name]) => name === 'focus px')"
+        figures = "latest.health.figures.some(([name]) => name === 'line width')"
         wait_for(tab, slot, f"bitmaps.counts && latest.profile && {figures}", write)
         assert tab.page.inner_text("#row-title") == "Row profile, mean of all rows"
         assert tab.page.evaluate("latest.profile.profile.length") == WIDTH
-        assert "1.25" in tab.page.inner_text("#health")
+        assert "1.25 px (left none, middle none, right none)" in tab.page.inner_text("#health")
+        assert tab.page.is_hidden(".cloud")
+        assert tab.page.is_visible("#counts")
         tab.screenshot("align-phone")
