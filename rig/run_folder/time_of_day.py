@@ -396,8 +396,8 @@ def line_below(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
     far that may be off.
 
     x, y: seconds, x from 0 on, at least one point. For fewer than `LEAST_ARRIVALS` points or less than `LEAST_SPAN_S`
-    of x, and for a slope above `CLOCK_TOLERANCE`, the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it may be off by
-    `_SLOPE_DELAYS` medians of the delays over the length of the edge.
+    of x the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it may be off by `_SLOPE_DELAYS` medians of the delays over the
+    length of the edge, unless it or this is above `CLOCK_TOLERANCE`.
     """
     span = max(x) - min(x)
     if span >= LEAST_SPAN_S and len(x) >= LEAST_ARRIVALS:
@@ -406,9 +406,9 @@ def line_below(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
         at = min(max(bisect_right([point[0] for point in hull], middle), 1), len(hull) - 1)
         (x0, y0), (x1, y1) = hull[at - 1], hull[at]
         slope = (y1 - y0) / (x1 - x0)
-        if abs(slope) <= CLOCK_TOLERANCE:
-            above = sorted(b - y0 - slope * (a - x0) for a, b in zip(x, y, strict=True))
-            uncertainty = min(CLOCK_TOLERANCE, _SLOPE_DELAYS * above[len(above) // 2] / (x1 - x0))
+        above = sorted(b - y0 - slope * (a - x0) for a, b in zip(x, y, strict=True))
+        uncertainty = _SLOPE_DELAYS * above[len(above) // 2] / (x1 - x0)
+        if max(abs(slope), uncertainty) <= CLOCK_TOLERANCE:  # else what is known of crystals says more
             return y0 - (slope - uncertainty) * x0, slope, uncertainty
     return min(b + CLOCK_TOLERANCE * a for a, b in zip(x, y, strict=True)), 0.0, CLOCK_TOLERANCE
 
