@@ -11,6 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 
 demo: .venv/.installed  ## scan the simulated rig in a foggy street
 	$(BIN)/rig scan --out runs/demo-$$(date +%Y%m%d-%H%M%S)
+	@echo "next: $(BIN)/rig demo records such a scan, replays it, and shows it in the browser"
 
 install: .venv/.installed-tests  ## set up .venv with everything that tests need; again after a change of pyproject.toml
 

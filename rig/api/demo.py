@@ -23,8 +23,8 @@ REPLAY: Final = "replay"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstration:
-    """What a demonstration made, in the folders RECORDING and REPLAY. same: whether the replay's depth maps are those
-    of the recorded scan, bit for bit."""
+    """The two runs of a demonstration, in its folders RECORDING and REPLAY. same: whether the replay's depth maps are
+    those of the recorded scan, bit for bit."""
 
     folder: Path
     recorded: RunResult
@@ -32,7 +32,7 @@ class Demonstration:
     same: bool
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The summaries of both as plain values."""
         runs = {RECORDING: self.recorded, REPLAY: self.replayed}
         summaries = {name: run.summary.as_json() for name, run in runs.items()}
         return {"folder": str(self.folder), "same": self.same, **summaries}

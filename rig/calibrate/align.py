@@ -115,7 +115,7 @@ class Alignment:
         return self.last is not None and self.last.focus_px is not None
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """The figures as plain values, with a verdict: 'line', 'no line' or 'aborted'."""
         verdict = "line" if self.found else "no line" if self.last is not None else "aborted"
         return {"config": self.name, "verdict": verdict, **({} if self.last is None else asdict(self.last))}
 

@@ -319,7 +319,7 @@ def row_content(
 
 
 def laser_content(rig: OpenRig) -> dict[str, Any]:
-    """What the laser said last, by the names of `LaserStatus`; empty if it has said nothing.
+    """The laser's name and what it said last, by the names of `LaserStatus`; the name alone if it has said nothing.
 
     A real laser is not asked here: the guard does so every second while it is armed. Raises DeviceError for a simulated
     one that is closed.
