@@ -136,7 +136,7 @@ class Points(NamedTuple):
 
 
 def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits: Limits | None) -> Points | None:
-    """At most `most` points of a map, spread evenly over its pixels, in colours. None without depth or rays.
+    """At most `most` points of a map, spread evenly over its pixels, in colours. None if there are none.
 
     by: one of COLOURS. limits: of the colours of depth.
     """
@@ -145,6 +145,8 @@ def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits:
         return None
     u, v = shown.rays
     pixels = np.flatnonzero(kept & np.isfinite(u) & np.isfinite(v))
+    if not len(pixels):
+        return None
     chosen = pixels[evenly_spread(len(pixels), most)]
     z = shown.depth_m.reshape(-1)[chosen]
     xyz = np.stack([u.reshape(-1)[chosen] * z, v.reshape(-1)[chosen] * z, z], axis=1).astype(np.float32)

@@ -167,7 +167,7 @@ class _Shows:
             "again": self._estimated_again,
             "doubts": list(shown.about.get("doubts") or ()),
         }
-        if found is None or not len(found.xyz_m):
+        if found is None:
             if self._cloud is not None:
                 self._cloud.remove()
                 self._cloud = None

@@ -91,6 +91,8 @@ def test_another_map_another_colour_and_a_least_confidence_change_points_and_pic
     tab.until("latest.map.least === 0.995")
     kept = int(np.count_nonzero((confidence >= np.float32(0.995)) & (confidence > 0)))
     assert tab.page.evaluate("latest.map.points") == kept < all_points
+    tab.page.locator("#least").fill("10")
+    tab.until("latest.map.least === 0.999")
     tab.page.locator("#least").fill("0")
     tab.page.select_option("#colour", "depth")
     tab.page.click("#after")
