@@ -57,6 +57,8 @@ _OTHERS = {
 }
 """Other files of this program that a user may mistake for a config, by their key `format`."""
 _CONFIG = ("a config", "scan: {columns: 500}")
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""The form of JSON schema that pydantic writes, by its name."""
 MAX_PATH = 1000
 """Text of this many characters or more is not taken for a path."""
 SCENE = ("world", "scene")
@@ -187,8 +189,11 @@ def find_config(name_or_path: str | Path) -> Path:
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of a rig config, with the installed kinds for the world and each device."""
-    schema = RigConfig.model_json_schema()
+    """JSON schema of a rig config, with the installed kinds of the world and each device, and the estimators.
+
+    Editors of YAML check a file by it if the file begins with `# yaml-language-server: $schema=FILE`.
+    """
+    schema = {"$schema": DIALECT, **RigConfig.model_json_schema()}
     definitions = schema.setdefault("$defs", {})
     definitions.pop("KindConfig", None)
     for slot in SLOTS:
@@ -198,6 +203,7 @@ def config_schema() -> dict[str, Any]:
             for key, value in kind.pop("$defs", {}).items():
                 definitions[f"{slot}.{name}.{key}"] = value
             kind["properties"]["kind"] = {"const": name}
+            kind["required"] = ["kind", *(key for key in kind.get("required", ()) if key != "kind")]
             definitions[f"{slot}.{name}"] = kind
             choices.append({"$ref": f"#/$defs/{slot}.{name}"})
         described = {k: v for k, v in schema["properties"][slot].items() if k in ("description", "default")}
