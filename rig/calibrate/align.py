@@ -226,7 +226,7 @@ class LineLook:
 
     sweep: its number, from 1. widths_px: of the line in the whole image and in its thirds, None where none stands out.
     line_seen, mean_rate: as in `AlignFigures`. peak_rates: float64 (n,), of the sure stripes' brightest pixels.
-    profile: float64 (width,), detections per exposure at each x, summed over the columns, mean of the rows.
+    profile: float64 (width,), detections per exposure and pixel at each x, mean over the sweep and the rows.
     """
 
     sweep: int
@@ -246,7 +246,7 @@ class LineLook:
         rates = row_rates(volume)
         third = rates.shape[1] // 3
         parts = rates, rates[:, :third], rates[:, third:-third], rates[:, -third:]
-        profile = volume.intensity().sum(axis=0) / (counts.shape[1] * float(frames.mean()))
+        profile = volume.intensity().sum(axis=0) / (counts.shape[1] * float(frames.sum()))
         return cls(
             sweep,
             tuple(line_width_px(part) for part in parts),

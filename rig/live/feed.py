@@ -252,6 +252,7 @@ class Feed:
                 "high_water": now.stages.ring_high_water,
                 "bytes": now.stages.ring_bytes,
                 "dropped_frames": now.stages.dropped_frames,
+                "waits": rig.spad.info.can_wait,  # then a full ring holds the source up, and nothing is lost
             }
         if begun.folder is not None:
             written = None if now is None else now.stages.recorder_bytes

@@ -111,7 +111,7 @@ def _ring(status: Mapping[str, Any]) -> Iterator[Figure]:
     fill, dropped = float(ring.get("fill") or 0.0), int(ring.get("dropped_frames") or 0)
     said = f"{fill:.0%} full, at most {ring.get('high_water')} of {ring.get('slots')} blocks"
     said += f", {_whole(dropped)} frames dropped" if dropped else ""
-    yield Figure("ring", said, BAD if dropped else WARN if fill >= RING_FULL else GOOD)
+    yield Figure("ring", said, BAD if dropped else WARN if fill >= RING_FULL and not ring.get("waits") else GOOD)
 
 
 def _disk(status: Mapping[str, Any]) -> Iterator[Figure]:

@@ -96,7 +96,7 @@ def test_saturated_and_sure_stripes_are_counted_by_their_brightest_pixel() -> No
     assert figures.peak_rate == pytest.approx(0.95)
     assert figures.scan_peak_rate == pytest.approx(1 - 0.05**2), "at twice the power"
     assert figures.mean_rate == pytest.approx(counts.sum() / 10 / counts.size)
-    assert look.profile[20] == pytest.approx(counts.sum() / 10 / 2)
+    assert look.profile[20] == pytest.approx(counts.sum() / 40 / 2)
     assert (figures.sweeps, figures.lost) == (7, 3)
 
 
