@@ -38,7 +38,7 @@ td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; w
 figure {{ margin: 0.4em 0; min-width: 0; max-width: 640px }}
 figcaption, .small {{ color: #5f6d7b; font-size: 0.88em }}
 img, svg {{ max-width: 100%; height: auto; display: block }}
-.legend span {{ display: inline-block; margin-right: 1.4em; white-space: nowrap }}
+.legend span {{ display: inline-block; margin-right: 1.4em }}
 .key {{ display: inline-block; vertical-align: -2px }}
 .side > svg {{ flex: 1 1 300px; min-width: 0; max-width: 400px }}
 pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 1.35; overflow-x: auto;
@@ -48,7 +48,7 @@ pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 
   body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3 {{ break-after: avoid }}
   figure, img, svg, tr, .good, .bad {{ break-inside: avoid }} .wide {{ overflow: visible }}
   .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
-  .side figure {{ flex-basis: 45% }} .legend span {{ display: inline-block; margin-right: 1.4em; white-space: nowrap }}
+  .side figure {{ flex-basis: 45% }} .legend span {{ display: inline-block; margin-right: 1.4em }}
 .key {{ display: inline-block; vertical-align: -2px }}
 .side > svg {{ flex-basis: 30% }}
 }}

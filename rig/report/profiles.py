@@ -49,8 +49,10 @@ def row_profiles(runs: Sequence[RunFacts]) -> str:
     return legend(list(shown.values())) + "".join(parts) if parts else ""
 
 
-def _name(runs: Sequence[RunFacts], run: RunFacts, what: str) -> str:
-    return what if len(runs) == 1 else f"{what}, {run.name}"
+def _curve(runs: Sequence[RunFacts], run: RunFacts, what: str, colour: str, points: Sequence[Point]) -> Series:
+    """A curve of a run; that of a second run is dashed, to be told from the first one's in a grey print."""
+    label = what if len(runs) == 1 else f"{what}, {run.name}"
+    return Series(label, colour, points, dashed=run is not runs[0], marker=False, gaps=True)
 
 
 def _depth(runs: Sequence[RunFacts], row: int) -> Panel | None:
@@ -59,10 +61,10 @@ def _depth(runs: Sequence[RunFacts], row: int) -> Panel | None:
     for run, colour in zip(runs, RUN_COLOURS, strict=False):
         true_m = run.truth.get("depth_m")
         if not series and true_m is not None and row < len(true_m):
-            series.append(Series("true depth", _TRUTH, _along(true_m[row]), dashed=True, marker=False, gaps=True))
+            series.append(Series("true depth", _TRUTH, _along(true_m[row]), marker=False, gaps=True))
         if run.depth_m is not None and row < len(run.depth_m):
             points = _along(run.depth_m[row])
-            series.append(Series(_name(runs, run, "depth"), colour, points, marker=False, gaps=True))
+            series.append(_curve(runs, run, "depth", colour, points))
     return Panel("Depth", "x, px", "depth, m", series, x_log=False, y_log=False) if _any(series) else None
 
 
@@ -77,7 +79,7 @@ def _light(runs: Sequence[RunFacts], row: int) -> Panel | None:
         order = sure[np.argsort(stripe["x_px"][row, sure])]
         for name, each in (("signal", colour), ("haze", haze_colour)):
             points = _broken(stripe["x_px"][row, order], stripe[name][row, order])
-            series.append(Series(_name(runs, run, name), each, points, marker=False, gaps=True))
+            series.append(_curve(runs, run, name, each, points))
     return Panel("Light of the stripes", "x, px", "photons per exposure", series, x_log=False) if _any(series) else None
 
 

@@ -214,7 +214,9 @@ def _taken_exactly(run: RunFacts) -> str:
     )
     if not first:
         return "-"
-    return f"{first} " + ("(simulated time)" if within_s is None else f"+- {within_s * 1e3:.3g} ms")
+    return f"{str(first).replace('T', ' ').removesuffix('Z')} UTC " + (
+        "(simulated time)" if within_s is None else f"+- {within_s * 1e3:.3g} ms"
+    )
 
 
 def _estimator(run: RunFacts) -> str:
