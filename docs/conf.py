@@ -32,6 +32,7 @@ exclude_patterns += ["calibration", "config", "drivers", "rig", "sim_backend", "
 
 highlight_language = "none"
 myst_heading_anchors = 4
+smartquotes = False  # options begin with two hyphens
 # A docstring is plain text, in which `this` is code.
 default_role = "code"
 autodoc_member_order = "bysource"

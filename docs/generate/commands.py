@@ -31,7 +31,7 @@ def _section(name: str, command: Any) -> str:
     if hasattr(command, "commands"):
         return text
     context = command.context_class(command, info_name=name)
-    usage = " ".join(dict.fromkeys(command.collect_usage_pieces(context))).translate(_PLAIN)
+    usage = " ".join(dict.fromkeys(command.collect_usage_pieces(context))).translate(_PLAIN).replace("[[", "[").replace("]]", "]")
     text += f"\n```\n{name} {usage}\n```\n"
     for kind, head in (("argument", "argument"), ("option", "option")):
         records = [one.get_help_record(context) for one in command.params if one.param_type_name == kind]

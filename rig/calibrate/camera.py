@@ -36,9 +36,11 @@ def calibrate_camera(
 ) -> CalibrationResult:
     """Calibrate the camera alone (`rig calibrate camera`).
 
-    sources: rigs or folders of views, as for the other calibrations, or pictures, or folders of pictures. request,
-    changes: options, as a `CameraRequest` or by the names of its fields. Raises UsageError for a wrong request, and
-    Degenerate if the views give no calibration: its message is the likeliest cause, its notes are other possible ones.
+    sources: rigs or folders of views, as for the other calibrations, or pictures, or folders of pictures.
+    request, changes: options, as a `CameraRequest` or by the names of its fields.
+
+    Raises UsageError for a wrong request, and Degenerate if the views give no calibration: its message is the likeliest
+    cause, its notes are other possible ones.
     """
     request = replace(request or CameraRequest(), **changes)
     si_values(request)
