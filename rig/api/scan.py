@@ -77,6 +77,8 @@ def scan(
     settings = _configured(config, request)
     if switch is None and request.record_on_request:
         switch = RecordingSwitch(request.before or 0.0)
+    elif switch is not None and switch.parts:
+        raise UsageError("this switch has recorded a scan already; make a new one for each")
     steering = Steering(on_map, settings, request)
     listeners = replace(_listeners(progress, live, monitor, on_space), enough=steering.enough)
     extra: dict[str, Any] = {}
@@ -222,8 +224,6 @@ def _switch_problems(request: RunRequest, switch: RecordingSwitch | None) -> lis
         problems.append("`record` writes all frames, `record_on_request` parts of them; leave one of the two out")
     if request.out is None:
         problems.append("a recording on request is written into the run's folder; name one with `out`")
-    if switch.parts:
-        problems.append("this switch has recorded a scan already; make a new one for each")
     return problems
 
 

@@ -57,7 +57,7 @@ class RecordingSwitch:
         self._wanted = False
         self._pending = False
         self.parts: list[RecordedPart] = []
-        """The parts so far; the last one may still grow."""
+        """The parts so far, of all scans of the call; the last one may still grow."""
 
     @property
     def wanted(self) -> bool:
@@ -152,6 +152,8 @@ class PartsRecording:
     ) -> None:
         _require_memory(held_bytes, switch.before_s)
         self.keep_blocks = keep_blocks
+        self.parts: list[RecordedPart] = []
+        """The parts of this scan, in order."""
         self._folder = folder
         self._switch = switch
         self._manifest = manifest
@@ -243,7 +245,7 @@ class PartsRecording:
         """The parts, and the frames (start, first, last) that came and were not recorded, as plain values."""
         return {
             "before_s": self._switch.before_s,
-            "parts": [part.content() for part in self._switch.parts],
+            "parts": [part.content() for part in self.parts],
             "not_recorded": [list(gap) for gap in self._not_recorded()],
         }
 
@@ -262,7 +264,7 @@ class PartsRecording:
 
     def _finish_parts(self, manifest: Mapping[str, Any]) -> None:
         sweeps = manifest["sweeps"]
-        for part, recording in zip(self._switch.parts, self._recordings, strict=True):
+        for part, recording in zip(self.parts, self._recordings, strict=True):
             first = self._starts[part.start].first_map + part.first_sweep
             end = first + part.sweeps
             known = end <= len(sweeps)
@@ -321,7 +323,7 @@ class PartsRecording:
             raise RecordingError(
                 f"cannot write the next part of {self._folder}: {error.strerror or error}; free the space it needs"
             ) from error
-        number = len(self._switch.parts)
+        number = len(self.parts)
         first = _first_of(held, self._since)
         self._since = None
         header = held[first].block.header
@@ -330,6 +332,7 @@ class PartsRecording:
         part.first_sweep = header.sweep - bool(begins)
         recording.begin(0)
         self._part = part
+        self.parts.append(part)
         self._switch.parts.append(part)
         for each in list(held)[first:]:
             self._write(each)
@@ -339,7 +342,7 @@ class PartsRecording:
     def _write(self, each: _Held) -> None:
         part, block = self._part, each.block
         assert part is not None, "called within a part"
-        each.written = self._recordings[len(self._switch.parts) - 1].submit(block)
+        each.written = self._recordings[len(self.parts) - 1].submit(block)
         first = block.header.first_frame
         if part.end_frame and first > part.end_frame:
             part.lost.append((part.end_frame, first - 1))
@@ -356,7 +359,7 @@ class PartsRecording:
         part, self._part = self._part, None
         if part is not None:
             part.ended = True
-            self._helper.submit(self._close, self._recordings[len(self._switch.parts) - 1])
+            self._helper.submit(self._close, self._recordings[len(self.parts) - 1])
 
     # On the helper's thread
 
@@ -392,7 +395,7 @@ class PartsRecording:
         for number, start in enumerate(self._starts):
             if start.first is None:
                 continue
-            spans = [(part.first_frame, part.end_frame) for part in self._switch.parts if part.start == number]
+            spans = [(part.first_frame, part.end_frame) for part in self.parts if part.start == number]
             for before, after in pairwise([(0, start.first), *spans, (start.end, 0)]):
                 if before[1] < after[0]:
                     gaps.append((number, before[1], after[0] - 1))
