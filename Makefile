@@ -5,7 +5,7 @@ BIN := .venv/bin
 export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo help install test checks kernels lint types layers house docs figures unit clean
-.PHONY: accuracy accuracy-rows accuracy-joint accuracy-calibration
+.PHONY: packages pythons accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
 
@@ -48,6 +48,11 @@ WORKERS ?= 4
 PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile
 unit: .venv/.installed-tests  ## the quick tests of single modules, for while you develop (90 s)
 	$(PYTEST) -m "not slow" tests/unit
+
+packages: .venv/.installed-tests  ## wheel and source distribution, installed and tried outside the checkout (ten minutes)
+	$(BIN)/python -m tests.campaigns.packages
+pythons: .venv/.installed-tests  ## the same on every Python found, and with the oldest dependencies allowed (an hour)
+	$(BIN)/python -m tests.campaigns.packages --every --oldest
 
 # Over the scenes of ../shared/scenes or, where there are none, the built-in one.
 accuracy: accuracy-rows accuracy-joint accuracy-calibration  ## the three below: tables of docs/results/ (hours)

@@ -34,6 +34,15 @@ def one_of(kind: Kind) -> Callable[[str], list[str]]:
     return complete
 
 
+def among(*choices: str) -> Callable[[str], list[str]]:
+    """A completer for a value that is one of these words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in choices if word.startswith(incomplete)]
+
+    return complete
+
+
 def some_of(kind: Kind) -> Callable[[str], list[str]]:
     """A completer for the last of several names separated by commas."""
 

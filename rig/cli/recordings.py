@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import Answer, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
+from rig.cli.completion import among
 from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.requests import CutRequest, ExportRequest, ImportRequest, ReplayRequest, RunsRequest
@@ -162,7 +163,12 @@ def runs_command(
 
 
 def record_command(
-    wish: Annotated[str, typer.Argument(metavar="on|off|state", help="what to do", show_default=False)],
+    wish: Annotated[
+        str,
+        typer.Argument(
+            metavar="on|off|state", help="what to do", show_default=False, autocompletion=among("on", "off", "state")
+        ),
+    ],
     run: Annotated[
         Path | None,
         typer.Argument(metavar="[RUN]", help="folder of the scan", show_default="the only one that goes on in runs"),
@@ -224,7 +230,13 @@ def report_command(
 def import_command(
     request: ImportRequest,
     kind: Annotated[
-        str, typer.Argument(metavar="KIND", help="pi-imaging, swissspad2 or photoncube", show_default=False)
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help="pi-imaging, swissspad2 or photoncube",
+            show_default=False,
+            autocompletion=among("photoncube", "pi-imaging", "swissspad2"),
+        ),
     ],
     files: Annotated[
         list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
@@ -245,7 +257,15 @@ def import_command(
 def export_command(
     request: ExportRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run", show_default=False)],
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="npy, hdf5, ply, png or mp4", show_default=False)],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help="npy, hdf5, ply, png or mp4",
+            show_default=False,
+            autocompletion=among("hdf5", "mp4", "npy", "ply", "png"),
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
     ] = None,

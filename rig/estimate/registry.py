@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from drivers.errors import UnknownKind
-from drivers.registry import load_entry
 from rig.config.estimators import ESTIMATORS as ESTIMATORS
 from rig.config.estimators import SLOT
 from rig.errors import UsageError
@@ -157,6 +155,9 @@ def is_coupled(name: str) -> bool:
 
 
 def _kind(name: str) -> EstimatorKind:
+    from drivers.errors import UnknownKind  # late: shells ask this module for names at every Tab
+    from drivers.registry import load_entry
+
     try:
         return load_entry(SLOT, name, entry_points(group=f"spadrig.{SLOT}"), EstimatorKind)
     except UnknownKind as error:

@@ -1,6 +1,7 @@
 """The other commands, and the command line itself."""
 
 import errno
+import inspect
 import json
 import os
 import subprocess
@@ -79,11 +80,26 @@ def completed(shell: str, line: str) -> list[str]:
         ("rig effects --scene street-d", ["street-dense-fog"]),
         ("rig tradeoff --estimators edge,j", ["edge,joint"]),
         ("rig reconstruct --filter m", ["median"]),
+        ("rig record o", ["on", "off"]),
+        ("rig export take p", ["ply", "png"]),
+        ("rig import s", ["swissspad2"]),
+        ("rig align lab-e", ["lab-emulated", "lab-etherdream-emulated"]),
         ("rig scan ./my", []),
     ],
 )
 def test_shells_complete_commands_options_and_names(line: str, names: list[str]) -> None:
     assert completed("bash", line) == names
+
+
+def test_the_words_that_shells_complete_are_those_that_commands_take() -> None:
+    from rig.cli.recordings import _WISHES, export_command, import_command
+    from rig.exchange.exporting import EXPORT_KINDS
+    from rig.exchange.importing import _KINDS
+
+    for command, known in ((export_command, EXPORT_KINDS), (import_command, _KINDS)):
+        (asked,) = inspect.signature(command).parameters["kind"].annotation.__metadata__
+        assert sorted(asked.autocompletion("")) == sorted(known)
+    assert completed("bash", "rig record ") == list(_WISHES)
 
 
 def test_other_shells_get_the_same_names() -> None:
