@@ -209,6 +209,11 @@ class MapTally:
         return len(self._maps)
 
     @property
+    def fog(self) -> list[FogEstimate]:
+        """The readings of the fog meter, map by map."""
+        return [each.fog for each in self._maps]
+
+    @property
     def doubts(self) -> tuple[Doubt, ...]:
         """Reasons against maps, each with the maps concerned."""
         of_reason: dict[str, list[int]] = {}

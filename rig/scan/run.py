@@ -9,7 +9,7 @@ import math
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +19,7 @@ from calibration.model.rig_model import RigModel
 from drivers.interfaces import SpadCounters, SweepTruth
 from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.count.sweeps import Gap, SweepAccount
+from rig.depth.fog_meter import FogEstimate
 from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.progress import tell_stage
@@ -307,8 +308,8 @@ def _markers_lost(sweep: SweepAccount) -> bool:
     return sweep.frames.lost > 0 and math.isnan(sweep.residual_columns)
 
 
-def sweep_content(sweep: SweepAccount) -> dict[str, Any]:
-    """The account of one sweep as plain values for the manifest."""
+def sweep_content(sweep: SweepAccount, fog: FogEstimate) -> dict[str, Any]:
+    """The account of one sweep as plain values for the manifest. fog: the reading of its map."""
     return {
         "direction": sweep.direction,
         "first_frame": sweep.first_frame,
@@ -318,4 +319,5 @@ def sweep_content(sweep: SweepAccount) -> dict[str, Any]:
         "clock_error": sweep.clock_error,
         "residual_columns": sweep.residual_columns,
         "detection_probability": sweep.detection,
+        "fog": asdict(fog),
     }

@@ -190,7 +190,10 @@ def run_scan(
     )
     manifest |= {
         **time_content(),
-        "sweeps": [sweep_content(sweep) | at for sweep, at in zip(sweeps, of_maps or [{}] * len(sweeps), strict=True)],
+        "sweeps": [
+            sweep_content(sweep, fog) | at
+            for sweep, fog, at in zip(sweeps, run.tally.fog, of_maps or [{}] * len(sweeps), strict=True)
+        ],
         "gaps": [list(gap) for gap in (*(gap for sweep in sweeps for gap in sweep.gaps), *outside)],
         "counters": asdict(counters),
     }

@@ -38,7 +38,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class Refused:
     """A request that is not answered. status: of HTTP. why: a sentence for the person at the browser."""
 
     status: int
@@ -94,17 +94,17 @@ class Access:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
-    def refusal(self, asked: Asked) -> Refusal | None:
-        """Why a request is not answered; None if it is. `brings_token` says whether it comes with the token."""
+    def refusal(self, asked: Asked) -> Refused | None:
+        """The reason why a request is not answered; None if it is. `brings_token`: whether its address has the token."""
         if len(asked.hosts) != 1 or not self._is_here(asked.hosts[0]):
-            return Refusal(421, "This page answers only to this computer's own name or number.")
+            return Refused(421, "This page answers only to this computer's own name or number.")
         if len(asked.origins) > 1 or (asked.socket and not asked.origins):
-            return Refusal(403, "A web socket of this page is opened by the page itself alone.")
+            return Refused(403, "A web socket of this page is opened by the page itself alone.")
         if asked.origins and asked.origins[0] != f"http://{asked.hosts[0]}":
-            return Refusal(403, "This page answers to no other page.")
+            return Refused(403, "This page answers to no other page.")
         if self.token is None or self._is_token(self._from_cookies(asked)) or self.brings_token(asked):
             return None
-        return Refusal(
+        return Refused(
             401, "This page needs a token. Open the whole address that 'rig view' printed, with ?token= at its end."
         )
 

@@ -42,20 +42,20 @@ WISHES: Final[Mapping[str, Mapping[str, type]]] = {
     "recorded": {},
     "stop": {},
 }
-"""What a page may ask for, each with its values: the row under the cursor, a map of a run, colours of the points, the
+"""Wishes of pages with their values: the row under the cursor, a map of a run, colours of the points, the
 least confidence shown, an estimate with another estimator, the map as it was recorded again, and the end of the run."""
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """What a page asks for. page: its number. ask: a key of `WISHES`. values: those that belong to it."""
+class PageWish:
+    """A wish of a page. page: its number. ask: a key of `WISHES`. values: those that belong to it."""
 
     page: int
     ask: str
     values: Mapping[str, Any]
 
     @classmethod
-    def parse(cls, page: int, text: str | bytes) -> "Wish":
+    def parse(cls, page: int, text: str | bytes) -> "PageWish":
         """Read a message. Raises ValueError if no page of ours sends such a one."""
         try:
             content = json.loads(text)
@@ -117,8 +117,8 @@ class Pages:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pages: dict[int, _Page] = {}
         self._newest: dict[str, bytes] = {}
-        self._wishes: deque[Wish] = deque(maxlen=_MOST_WISHES)
-        self._following: dict[int, Wish] = {}
+        self._wishes: deque[PageWish] = deque(maxlen=_MOST_WISHES)
+        self._following: dict[int, PageWish] = {}
         self._last_number = 0
 
     @property
@@ -142,7 +142,7 @@ class Pages:
         """Tell one page; nothing happens if it is gone."""
         self._soon(self._answer, page, topic, message_bytes(topic, content))
 
-    def wishes(self) -> tuple[list[Wish], list[Wish]]:
+    def wishes(self) -> tuple[list[PageWish], list[PageWish]]:
         """Wishes since the last call in their order, and for each page that follows a row its newest wish for one."""
         taken = []
         while self._wishes:
@@ -164,7 +164,7 @@ class Pages:
                     await connection.close(_POLICY, "too many messages")
                     return
                 try:
-                    wish = Wish.parse(page.number, text)
+                    wish = PageWish.parse(page.number, text)
                 except ValueError:
                     await connection.close(_POLICY, "no page of ours asks so")
                     return
@@ -176,7 +176,7 @@ class Pages:
             await asyncio.gather(sender, return_exceptions=True)
             self._wake.set()
 
-    def _note(self, wish: Wish) -> None:
+    def _note(self, wish: PageWish) -> None:
         if wish.ask == "row":
             self._following.pop(wish.page, None)
             self._following[wish.page] = wish

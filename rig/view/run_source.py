@@ -67,6 +67,15 @@ class RunSource:
         self.min_confidence = float(estimate.get("min_confidence", 0.5))
 
     @property
+    def fog(self) -> list[tuple[int, Mapping[str, Any]]]:
+        """Number and reading of the fog meter of each map; of the last one alone in runs that kept no others."""
+        readings = [sweep.get("fog") for sweep in self.manifest.get("sweeps") or ()]
+        if any(readings):
+            return [(number, fog) for number, fog in enumerate(readings) if isinstance(fog, Mapping)]
+        last = self.summary.get("fog")
+        return [(self.numbers[-1], last)] if isinstance(last, Mapping) else []
+
+    @property
     def recorded(self) -> bool:
         """Whether maps can be estimated again."""
         return self.rows is not None

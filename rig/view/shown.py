@@ -125,7 +125,7 @@ class Legend(NamedTuple):
         return cls(scale.colours(np.linspace(low, high, LEGEND)), (f"{low:.3g}", f"{high:.3g} {scale.unit}".rstrip()))
 
 
-class Points(NamedTuple):
+class ColouredPoints(NamedTuple):
     """Points of a map. xyz_m: float32 (n, 3). rgb: uint8 (n, 3). of: their number before they were thinned. legend:
     None if the map has no values for colours; points are grey then."""
 
@@ -135,7 +135,9 @@ class Points(NamedTuple):
     legend: Legend | None
 
 
-def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits: Limits | None) -> Points | None:
+def points(
+    shown: ShownMap, by: str, least_confidence: float, most: int, limits: Limits | None
+) -> ColouredPoints | None:
     """At most `most` points of a map, spread evenly over its pixels, in colours. None if there are none.
 
     by: one of COLOURS. limits: of the colours of depth.
@@ -152,8 +154,8 @@ def points(shown: ShownMap, by: str, least_confidence: float, most: int, limits:
     xyz = np.stack([u.reshape(-1)[chosen] * z, v.reshape(-1)[chosen] * z, z], axis=1).astype(np.float32)
     values, scale = _scaled(shown, by, limits)
     if values is None:
-        return Points(xyz, np.full((len(chosen), 3), 128, np.uint8), len(pixels), None)
-    return Points(xyz, scale.colours(values.reshape(-1)[chosen]), len(pixels), Legend.of(scale))
+        return ColouredPoints(xyz, np.full((len(chosen), 3), 128, np.uint8), len(pixels), None)
+    return ColouredPoints(xyz, scale.colours(values.reshape(-1)[chosen]), len(pixels), Legend.of(scale))
 
 
 def _scaled(shown: ShownMap, by: str, limits: Limits | None) -> tuple[NDArray[np.floating] | None, Scale]:

@@ -26,7 +26,7 @@ from rig.view import health
 from rig.view.access import Access
 from rig.view.estimation import Estimated, Estimation, EstimationRequest
 from rig.view.live_source import LiveNews, LiveSource, LiveState
-from rig.view.pages import Pages, Wish
+from rig.view.pages import Pages, PageWish
 from rig.view.run_source import RunSource, read_map
 from rig.view.server import ViewServer, listen, require_viser
 from rig.view.shown import COLOURS, Legend, Limits, ShownMap, picture_of, ply_of, points, steady_limits
@@ -183,7 +183,7 @@ class _Shows:
             told = {"there": drawn is not None, **_size(shown), **_legend(None if drawn is None else drawn.legend)}
             self.pages.tell(f"picture-{what}", told, b"" if drawn is None else drawn.png)
 
-    def take_common(self, wish: Wish) -> bool:
+    def take_common(self, wish: PageWish) -> bool:
         """Fulfil a wish that both kinds of pages have; False for another one."""
         if wish.ask == "colour" and wish.values["by"] in COLOURS:
             self._colour = wish.values["by"]
@@ -194,7 +194,7 @@ class _Shows:
         self.tell_map()
         return True
 
-    def answer_rows(self, following: Sequence[Wish], news: object = None) -> None:
+    def answer_rows(self, following: Sequence[PageWish], news: object = None) -> None:
         """Tell each page about the pixel under its cursor, if that or the map has changed. news: another object
         whenever the counts may have."""
         self._answered = {wish.page: self._answered.get(wish.page) for wish in following}
@@ -369,7 +369,8 @@ class _ShowsRun(_Shows):
         self.pages.tell("setup", told)
         self.pages.tell("state", {"state": "run", "text": ""})
         self.pages.tell("health", {"figures": health.of_summary(source.summary, source.manifest)})
-        self._tell_fog(source.summary.get("fog"), source.numbers[-1])
+        self._fog = {number: {"map": number, **(health.fog_of(fog) or {})} for number, fog in source.fog}
+        self._tell_fog()
         self._select(source.numbers[-1])
 
     def __exit__(self, *error: object) -> None:
@@ -405,11 +406,14 @@ class _ShowsRun(_Shows):
 
     def _select(self, number: int) -> None:
         try:
-            self._shown, self._estimated_again = self._source.map(number), False
+            self._shown, before = self._source.map(number), self._estimated_again
         except (RigError, DeviceError) as error:
             self.say(f"Map {number} cannot be shown: {error}")
             return
         self.say("")
+        self._estimated_again = False
+        if before:
+            self._tell_fog()
         self._label = f"map {number}" if self._shown.stripe else f"counts of map {number}, which has no estimate"
         if not self._source.recorded and not self._shown.stripe:
             self._label = f"sum {number} of imported frames"
@@ -446,7 +450,8 @@ class _ShowsRun(_Shows):
                 took_s = float(made.summary.get("compute_time_s") or 0.0)
                 self._label = f"map {asked.number}, estimated again with {asked.estimator} in {took_s:.2g} s"
                 self.tell_map()
-                self._tell_fog(made.summary.get("fog"), asked.number)
+                again = health.fog_of(made.summary.get("fog"))
+                self._tell_fog({asked.number: {"map": asked.number, **again}} if again else {})
         except RigError as error:
             self.say(str(error))
         finally:
@@ -454,9 +459,11 @@ class _ShowsRun(_Shows):
             self._again = None
             self.pages.tell("estimate", {"busy": False, "text": ""})
 
-    def _tell_fog(self, fog: Mapping[str, Any] | None, number: int) -> None:
-        reading = health.fog_of(fog)
-        self.pages.tell("fog", {"readings": [{"map": number, **reading}] if reading else []})
+    def _tell_fog(self, again: Mapping[int, dict[str, Any]] | None = None) -> None:
+        """Tell the readings of all maps. again: of a map that was estimated again, in the place of the run's."""
+        readings = sorted((self._fog | dict(again or {})).items())
+        kept = readings if len(readings) <= _FOG_KEPT else readings[:: -(-len(readings) // _FOG_KEPT)]
+        self.pages.tell("fog", {"readings": [reading for _, reading in kept]})
 
 
 def _pixel_m(shown: ShownMap) -> float:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.view import pages as pages_module
-from rig.view.pages import BURST, Allowance, Pages, Wish, message_bytes
+from rig.view.pages import BURST, Allowance, Pages, PageWish, message_bytes
 
 
 class Page:
@@ -168,7 +168,7 @@ _JSON = st.recursive(
 def test_no_text_makes_a_wish_with_values_of_other_types(row: Any, x: Any) -> None:
     text = json.dumps({"ask": "row", "row": row, "x": x})
     try:
-        wish = Wish.parse(1, text)
+        wish = PageWish.parse(1, text)
     except ValueError:
         return
     assert type(wish.values["row"]) is type(wish.values["x"]) is int
@@ -187,7 +187,7 @@ def test_no_text_makes_a_wish_with_values_of_other_types(row: Any, x: Any) -> No
 )
 def test_values_that_mean_nothing_are_refused(text: str) -> None:
     with pytest.raises(ValueError):
-        Wish.parse(1, text)
+        PageWish.parse(1, text)
 
 
 def test_an_allowance_lets_a_burst_pass_and_then_so_many_a_second(monkeypatch: pytest.MonkeyPatch) -> None:

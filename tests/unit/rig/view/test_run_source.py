@@ -46,6 +46,20 @@ def test_a_recorded_run_has_maps_rays_worth_and_rows(recorded: Path) -> None:
     assert source.row(1, HEIGHT) is None
 
 
+def test_the_fog_of_every_map_is_kept_and_of_older_runs_that_of_the_last(run: Path, tmp_path: Path) -> None:
+    assert [number for number, _ in RunSource(run).fog] == [0, 1]
+    foggy = tmp_path / "foggy"
+    scene = {"scene": "street", "estimator": "likelihood", "exposures": 8}
+    api.scan(write_rig(tmp_path / "rig"), maps=2, out=foggy, **scene)
+    summary = json.loads((foggy / "summary.json").read_text())
+    (first, of_first), (last, of_last) = RunSource(foggy).fog
+    assert (first, last) == (0, 1)
+    assert of_last == summary["fog"]
+    assert of_first.keys() == of_last.keys()
+    (foggy / "manifest.json").unlink()
+    assert RunSource(foggy).fog == [(1, summary["fog"])]
+
+
 def test_without_the_recording_rays_come_from_the_points_and_there_are_no_rows(run: Path) -> None:
     whole = RunSource(run).map(0)
     for file in run.glob("frames*"):
