@@ -21,7 +21,7 @@ help:  ## this list
 # The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
 	$(MAKE) --jobs=2 --output-sync=target checks kernels
-	$(MAKE) docs NOTEBOOKS=off
+	$(MAKE) docs NOTEBOOKS=off SITE=docs/_build/check
 	$(PYTEST) --durations=25
 
 checks: lint types layers house
@@ -39,8 +39,9 @@ house: .venv/.installed-tests
 	$(BIN)/python -m tests.reference.house --limits
 # Notebooks are run while the site is built; `make test` leaves that to the tests.
 NOTEBOOKS ?= force
+SITE ?= docs/_build/html
 docs: .venv/.installed-tests  ## the documentation site in docs/_build/html; its warnings are errors; needs no network
-	NOTEBOOKS=$(NOTEBOOKS) $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . docs/_build/html
+	NOTEBOOKS=$(NOTEBOOKS) $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . $(SITE)
 figures: .venv/.installed-tests  ## draw the figures of docs/figures/ anew
 	$(BIN)/python -m docs.generate.figures
 # Files of tests go to the workers whole: what they prepare once is prepared once.

@@ -60,8 +60,13 @@ def _read(app: Any, page: str, source: list[str]) -> None:
 
 
 def _outdated(app: Any, env: Any, *changes: set[str]) -> list[str]:
-    """Pages that are read again in every build, since they also depend on the program."""
-    return [page for page in env.found_docs if page == root_doc or MARK.search(Path(env.doc2path(page)).read_text())]
+    """Pages that are read again in every build, since they also depend on the program: generated ones and notebooks."""
+    texts = {page: Path(env.doc2path(page)) for page in env.found_docs}
+    return [page for page, file in texts.items() if page == root_doc or file.suffix == ".ipynb" or _is_generated(file)]
+
+
+def _is_generated(page: Path) -> bool:
+    return MARK.search(page.read_text(encoding="utf-8")) is not None
 
 
 def _tell(app: Any, what: str, name: str, of: object, options: object, lines: list[str]) -> None:
