@@ -46,9 +46,9 @@ def report(
     folder, second = Path(run), None if other is None else Path(other)
     kind = _kind(folder)
     missing: tuple[str, ...] = ()
-    for what, given in (("`other`", second), ("`map`", map)):
-        if given is not None and kind != "run":
-            raise UsageError(f"{what} is {given}, but {folder} is a {kind}; leave it out, or name a run")
+    if kind != "run" and (second is not None or map is not None):
+        what = f"beside {second}" if second is not None else f"with map {map}"
+        raise UsageError(f"{folder} is a {kind}, which cannot be shown {what}; name the folder of a run first")
     if kind == "run":
         if second is not None and _kind(second) != "run":
             raise UsageError(f"{second} is no run, so it cannot stand beside {folder}; name the folder of a run")

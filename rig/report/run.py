@@ -208,10 +208,8 @@ def _figures(runs: Sequence[RunFacts]) -> str:
 
 
 def _taken_exactly(run: RunFacts) -> str:
-    first, within_s = (
-        value_at(run.summary, "time.first_frame_utc"),
-        as_number(value_at(run.summary, "time.uncertainty_s")),
-    )
+    first = value_at(run.summary, "time.first_frame_utc")
+    within_s = as_number(value_at(run.summary, "time.uncertainty_s"))
     if not first:
         return "-"
     return f"{str(first).replace('T', ' ').removesuffix('Z')} UTC " + (

@@ -122,7 +122,7 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     elif counted is not None and shown is not None:
         reader.missing.append(f"The frames of map {shown} are not whole in the recording, so it has no counts.")
     elif not recorded:
-        reader.missing.append("The frames were not recorded (--record), so rows are shown without their counts.")
+        reader.missing.append("The frames were not recorded, so rows are shown without their counts.")
     facts["model"] = reader.get("calibration", lambda: _model(folder, manifest), "the calibration")
     if facts["model"] is None and (manifest.get("calibration") or {}).get("id"):
         reader.missing.append("The calibration is neither in the run nor where its config says, or has changed since.")

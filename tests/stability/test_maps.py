@@ -13,7 +13,7 @@ from calibration.model.camera import Camera
 from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from rig.count.volume import BIN_DARK, CountVolume, FrameTally, SweepCounter, SweepLayout, SweepTally, with_room
-from rig.depth.depth import depth_map
+from rig.depth.depth import DepthMap, depth_map
 from rig.depth.kernels import depth_rows, fill_rows
 from rig.errors import UsageError
 from rig.estimate.median import median_filter
@@ -64,7 +64,7 @@ def test_windows_hold_what_lies_in_the_depth_range_and_nothing_else(
     assert np.all(w[inside] >= (1 / (near * ratio) - slack)[inside])
 
 
-@covers(depth_map, depth_rows, fill_rows, StripeTable, median_filter)
+@covers(depth_map, DepthMap, depth_rows, fill_rows, StripeTable, median_filter)
 @EXAMPLES
 @given(
     seed=st.integers(0, 10**6),
@@ -94,6 +94,9 @@ def test_depth_lies_in_the_depth_range_or_there_is_none(seed, spread, missing, s
         assert np.all(confidence[~seen] == 0)
         np.testing.assert_array_equal(np.isfinite(sd_m), seen)
         assert np.all(sd_m[seen] >= 0)
+        left = DepthMap(depth, confidence, sd_m).without(seen)
+        for values, nothing in zip(left, DepthMap.empty(*depth.shape), strict=True):
+            np.testing.assert_array_equal(values, nothing)
     assert np.isnan(depth_map(empty, geometry, 0.5).depth_m).all()
 
 

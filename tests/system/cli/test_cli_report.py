@@ -131,7 +131,8 @@ def test_a_trade_off_has_the_page_that_it_wrote_itself(rig: Rig, small: Path) ->
         (("RUN", "--out", "gone/deep.html"), "cannot write gone/deep.html: No such file or directory"),
         (("broken.yaml",), "broken.yaml"),
         (("study",), "is no trade-off of this version"),
-        (("cal", "RUN"), "but cal is a calibration; leave it out, or name a run"),
+        (("cal", "RUN"), "cal is a calibration, which cannot be shown beside"),
+        (("cal", "--map", "1"), "cal is a calibration, which cannot be shown with map 1; name the folder of a run"),
         (("RUN", "cal"), "cal is no run, so it cannot stand beside"),
     ],
 )

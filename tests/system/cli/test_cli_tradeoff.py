@@ -39,7 +39,7 @@ def test_rows_files_and_the_setting_to_use(
     assert edge["clear", 8]["mean_abs_px"] < edge["60m", 8]["mean_abs_px"]
     assert edge["clear", 8]["sensor_ms"] > edge["clear", 2]["sensor_ms"] > 200 * 2 / 100  # columns, exposures, kHz
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
-        "tradeoff.json", "tradeoff.csv", "tradeoff.svg", "setting.yaml",
+        "tradeoff.json", "tradeoff.csv", "tradeoff.svg", "report.html", "setting.yaml",
     }  # fmt: skip
     answer = told["answer"]
     assert answer["fits"]

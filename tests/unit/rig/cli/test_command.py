@@ -12,7 +12,10 @@ from rig.cli.command import _OPTIONS, _SETTING, in_options
 from rig.cli.main import app
 
 ROOT = Path(__file__).parents[4]
-WHOLE_COMMANDS = {"rig/plan/calibration_reach.py", "rig/recording/inputs.py", "rig/recording/open.py"}
+WHOLE_COMMANDS = {
+    "rig/api/report.py", "rig/plan/calibration_reach.py", "rig/recording/inputs.py", "rig/recording/open.py",
+    "rig/report/run_settings.py",
+}  # fmt: skip
 """Modules whose messages hold a command line that can be copied, such as `rig reconstruct RUN --out DIR`."""
 
 

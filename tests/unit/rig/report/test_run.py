@@ -75,7 +75,7 @@ def test_five_rows_are_shown_with_depth_and_light(run: Path) -> None:
         ({"truth": False}, "The simulated world's truth was not written."),
         ({"calibrated": False}, "Without a calibration there is no depth."),
         ({"maps": 0}, "No map was made."),
-        ({}, "The frames were not recorded (--record)"),
+        ({}, "The frames were not recorded, so rows"),
         ({}, "The calibration is neither in the run nor where its config says"),
     ],
 )
