@@ -8,8 +8,6 @@ import typer
 from docs.generate.tables import code, table
 from rig.cli.main import app
 
-_PLAIN = str.maketrans({"{": "", "}": ""})
-
 
 def page() -> str:
     """Every command with its arguments and options, in the order of `rig --help`."""
@@ -31,7 +29,8 @@ def _section(name: str, command: Any) -> str:
     if hasattr(command, "commands"):
         return text
     context = command.context_class(command, info_name=name)
-    usage = " ".join(dict.fromkeys(command.collect_usage_pieces(context))).translate(_PLAIN).replace("[[", "[").replace("]]", "]")
+    arguments = [one.get_help_record(context) for one in command.params if one.param_type_name == "argument"]
+    usage = " ".join(["[OPTIONS]", *(record[0].partition(" <")[0] for record in arguments)])
     text += f"\n```\n{name} {usage}\n```\n"
     for kind, head in (("argument", "argument"), ("option", "option")):
         records = [one.get_help_record(context) for one in command.params if one.param_type_name == kind]
