@@ -204,8 +204,8 @@ def test_a_config_shown_keeps_what_is_written_and_is_the_very_same(name, tmp_pat
     file.write_text(shown, encoding="utf-8")
     assert load_config(file) == load_config(name)
     assert completed_text(file) == shown
-    calibration = f"calibration: {BUNDLED.resolve() / 'simulated-rig.yaml'} "
-    kept = [line.replace("calibration: simulated-rig.yaml ", calibration) for line in written.splitlines()]
+    absolute = rf"calibration: {BUNDLED.resolve()}/\1"
+    kept = [re.sub(r"^calibration: (\w+-rig\.yaml)", absolute, line) for line in written.splitlines()]
     rest = iter(shown.splitlines())
     left = [line for line in kept if "{" not in line and not any(line == other for other in rest)]
     assert left == []  # every line is there, in the same order; those with braces may be filled in
@@ -286,7 +286,7 @@ def test_every_extra_is_imported_somewhere() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     code = "".join(
         file.read_text()
-        for folder in ("rig", "drivers", "calibration", "sim_backend")
+        for folder in ("rig", "drivers", "calibration", "sim_backend", "spadrig")
         for file in (ROOT / folder).rglob("*.py")
     )
     for name, packages in extras.items():
