@@ -29,8 +29,8 @@ def _section(name: str, command: Any) -> str:
     if hasattr(command, "commands"):
         return text
     context = command.context_class(command, info_name=name)
-    arguments = [one.get_help_record(context) for one in command.params if one.param_type_name == "argument"]
-    usage = " ".join(["[OPTIONS]", *(record[0].partition(" <")[0] for record in arguments)])
+    arguments = [one for one in command.params if one.param_type_name == "argument"]
+    usage = " ".join(["[OPTIONS]", *(_in_usage(one, context) for one in arguments)])
     text += f"\n```\n{name} {usage}\n```\n"
     for kind, head in (("argument", "argument"), ("option", "option")):
         records = [one.get_help_record(context) for one in command.params if one.param_type_name == kind]
@@ -38,6 +38,12 @@ def _section(name: str, command: Any) -> str:
         if rows:
             text += "\n" + table((head, "meaning", "default"), rows)
     return text
+
+
+def _in_usage(argument: Any, context: Any) -> str:
+    """An argument's name in brackets if it may be left out, with dots if there may be several."""
+    name = str(argument.get_help_record(context)[0]).partition(" <")[0]
+    return f"{name}..." if argument.nargs == -1 and not name.endswith("...") else name
 
 
 def _told(help_text: str) -> tuple[str, str]:
