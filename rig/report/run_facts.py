@@ -154,9 +154,9 @@ class _Reader:
 
 def _map_files(reader: _Reader, name: str, manifest: Mapping[str, Any]) -> dict[str, Any]:
     """All that is known of a map."""
-    found: dict[str, Any] = {"stripe": reader.file(f"stripe/{name}.npz", load_arrays, "the stripe table") or {}}
+    found: dict[str, Any] = {"stripe": reader.file(f"stripe/{name}.npz", _stripe, "the stripe table") or {}}
     if (reader.folder / "depth").is_dir():
-        found["depth_m"] = reader.file(f"depth/{name}.npy", load_array, "the depth map")
+        found["depth_m"] = reader.file(f"depth/{name}.npy", _plane, "the depth map")
         worth = reader.file(f"confidence/{name}.npz", load_arrays, "confidence and error of each pixel") or {}
         for key in ("confidence", "depth_sd_m"):
             if key in worth:
@@ -226,6 +226,24 @@ def _json(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{file.name} is no object")
     return content
+
+
+def _stripe(file: Path) -> dict[str, Float32]:
+    """A stripe table's arrays, all of one size."""
+    table = load_arrays(file)
+    if lacking := [name for name in ("x_px", "confidence", "signal", "haze") if name not in table]:
+        raise ValueError(f"{file.name} has no {', '.join(lacking)}")
+    if len({values.shape for values in table.values()}) > 1 or table["x_px"].ndim != 2:
+        raise ValueError(f"the arrays of {file.name} have different sizes")
+    return table
+
+
+def _plane(file: Path) -> Float32:
+    """An array with a value for each pixel."""
+    values = load_array(file)
+    if values.ndim != 2 or not values.size:
+        raise ValueError(f"{file.name} has the shape {values.shape}, not one of rows and columns")
+    return np.asarray(values, np.float32)
 
 
 def _grey(file: Path) -> NDArray[np.uint8]:

@@ -104,6 +104,14 @@ def test_a_file_that_is_gone_or_torn_costs_no_more_than_itself(run: Path, name: 
     assert "Row 20" in torn or name.startswith("stripe")
 
 
+def test_arrays_that_are_none_of_a_map_are_named(run: Path) -> None:
+    np.save(run / "depth/000000.npy", np.zeros(7, np.float32))
+    np.savez(run / "stripe/000000.npz", x_px=np.zeros((3, 4), np.float32))
+    words = words_of(report(run))
+    assert "The depth map cannot be read: 000000.npy has the shape (7,)" in words
+    assert "The stripe table cannot be read: 000000.npz has no confidence, signal, haze." in words
+
+
 def test_a_run_without_maps_frames_and_summary_still_has_a_page(run: Path) -> None:
     for part in ("depth", "confidence", "stripe", "cloud", "intensity", "truth"):
         shutil.rmtree(run / part)
