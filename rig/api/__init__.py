@@ -21,7 +21,6 @@ require_own_names()  # here too: another package `rig` may have overwritten only
 from rig.api.demo import Demonstration, demonstrate
 from rig.api.example import ExampleRecording, example_recording
 from rig.api.quality import quality
-from rig.api.record import RecordState, record
 from rig.api.report import ReportResult, report
 from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
 from rig.api.runs import repeat, runs
@@ -39,6 +38,7 @@ from rig.config.bundled import bundled_rigs, bundled_scenes
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, PathLike, configure
 from rig.exchange.exporting import export_run
 from rig.exchange.importing import import_frames
+from rig.live.record_wish import RecordState, record
 from rig.plan.describe import plan_text
 from rig.recording.compress import compress
 from rig.recording.cut import cut

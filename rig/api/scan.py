@@ -10,7 +10,6 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
-from rig.api.record import followed
 from rig.api.steering import OnMap, Steering, note
 from rig.config.estimators import estimator_names, is_estimator
 from rig.config.files import load_cube_plan
@@ -22,6 +21,7 @@ from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError, noted
 from rig.estimate.registry import FILTERS
 from rig.live.feed import Feed
+from rig.live.record_wish import followed
 from rig.plan.scan_plan import ScanPlan
 from rig.progress import Progress
 from rig.recording.cube import open_cube

@@ -177,7 +177,9 @@ def record_command(
     """Switch the recording of a scan with --record-on-request on or off, while it goes on."""
     if wish not in _WISHES:
         raise UsageError(f"'{wish}' is no wish; write on, off or state")
-    state = api.record(_WISHES[wish], run)
+    from rig.live.record_wish import record  # without the rest of `rig.api`, which takes seconds to import
+
+    state = record(_WISHES[wish], run)
     doing = "recording" if state.recording else "not recording"
     said = f"{state.run}: {doing}, {state.parts} part{'' if state.parts == 1 else 's'} so far"
     return Answer(asdict(state), lambda: print(said))

@@ -24,7 +24,7 @@ from drivers.json_text import parse_json
 from drivers.replay.spad import ReplaySpad
 from rig.devices.open import OpenRig
 from rig.errors import UsageError
-from rig.run_folder.folder import replace_file
+from rig.run_folder.disk import replace_file
 from rig.run_folder.manifest import read_manifest
 
 _log = logging.getLogger(__name__)

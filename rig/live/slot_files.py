@@ -1,6 +1,6 @@
 """Files of slots: their private folder, their names, and whether the process of one is still there.
 
-A slot is `live-PID-N.slot`. Its writer holds the file's lock (`rig.run_folder.folder.hold`) as long as it lives, so
+A slot is `live-PID-N.slot`. Its writer holds the file's lock (`rig.run_folder.disk.hold`) as long as it lives, so
 that nobody mistakes a dead run's slot for a running one, even where the process number is in use again.
 """
 
@@ -15,7 +15,7 @@ from itertools import count
 from pathlib import Path
 
 from rig.errors import UsageError
-from rig.run_folder.folder import hold, is_held
+from rig.run_folder.disk import hold, is_held
 
 _YOUNG_S = 60.0
 """Age up to which an empty file may still be in the making."""

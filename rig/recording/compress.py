@@ -25,7 +25,7 @@ from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.verify import Integrity, examine
-from rig.run_folder.folder import sync_folder
+from rig.run_folder.disk import sync_folder
 from rig.run_folder.manifest import UNFINISHED
 
 LEVEL: Final = 3

@@ -22,7 +22,7 @@ from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
-from rig.run_folder.folder import is_held, replace_file, sync_folder
+from rig.run_folder.disk import is_held, replace_file, sync_folder
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
 from rig.run_folder.summary import RunVerdict
 

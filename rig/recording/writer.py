@@ -26,7 +26,7 @@ from drivers.ring import BlockRing, RingReader
 from drivers.spb1 import BlockLayout
 from rig.errors import RecordingError
 from rig.recording.segment import OpenSegment, Staging, paged
-from rig.run_folder.folder import hold, sync_folder
+from rig.run_folder.disk import hold, sync_folder
 from rig.threads import StageThread
 
 SEGMENT_BYTES: Final = 1 << 30

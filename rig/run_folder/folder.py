@@ -19,7 +19,6 @@ import os
 import re
 import secrets
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -38,6 +37,7 @@ from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.estimate.registry import Learned
 from rig.estimate.row.model import RowModel
+from rig.run_folder.disk import is_held, replace_file, sync_folder
 from rig.run_folder.manifest import MANIFEST, sealed_text
 from rig.run_folder.pictures import (
     cloud,
@@ -309,53 +309,3 @@ def _npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
-
-
-try:
-    import fcntl
-except ImportError:  # on Windows nobody else can change a file that is open
-    fcntl = None  # type: ignore[assignment]
-
-
-def hold(fd: int) -> None:
-    """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock."""
-    if fcntl is not None:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_held(file: Path) -> bool:
-    """Whether a file is locked (`hold`). False if there is no such file, and on Windows."""
-    if fcntl is None or not file.exists():
-        return False
-    with file.open("rb") as stream:
-        try:
-            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
-
-
-def replace_file(file: Path, data: bytes) -> None:
-    """Write a file in one step. However the program ends, the file has either its old or its complete new content.
-    Raises OSError.
-    """
-    scratch = file.with_name(f"{file.name}.part")
-    try:
-        with scratch.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        scratch.replace(file)
-    finally:
-        scratch.unlink(missing_ok=True)
-
-
-def sync_folder(path: Path) -> None:
-    """Make sure that the names of the files in a folder survive a loss of power. Raises OSError."""
-    if sys.platform == "win32":
-        return  # Windows opens no folders; NTFS keeps its names in a journal
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -28,7 +28,8 @@ from drivers.units import parse_quantity
 from rig.errors import RecordingError, UsageError
 from rig.recording.open import fitted_ratio
 from rig.recording.writer import WRITERS, Recording, next_block
-from rig.run_folder.folder import json_text, replace_file
+from rig.run_folder.disk import replace_file
+from rig.run_folder.folder import json_text
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, file_crc32, sealed_text
 from rig.run_folder.summary import RunVerdict
 

@@ -16,8 +16,8 @@ from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig import api
 from rig.api import RecordingSwitch, SeenMap
-from rig.api.record import STATE, record
 from rig.errors import RecordingError, UsageError
+from rig.live.record_wish import STATE, record
 from rig.recording.writer import Recording
 from rig.scan.on_request import PartsRecording
 from tests.system import small_rig

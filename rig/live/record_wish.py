@@ -12,19 +12,41 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from drivers.json_text import parse_json
-from rig.config.overrides import PathLike
 from rig.errors import UsageError
-from rig.run_folder.folder import hold, is_held, replace_file
-from rig.scan.on_request import RecordingSwitch
+from rig.run_folder.disk import hold, is_held, replace_file
 
 STATE: Final = "record.state"
 WISH: Final = "record.wish"
 LOOK_S: Final = 0.02
 ANSWER_S: Final = 5.0
 """Longest wait for a scan to do what was asked: its SPAD may be silent meanwhile."""
+
+
+class Switch(Protocol):
+    """A `rig.scan.on_request.RecordingSwitch`, which is not imported here: 'rig record' has to start quickly."""
+
+    parts: list[Any]
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it is switched on."""
+        ...
+
+    @property
+    def recording(self) -> bool:
+        """Whether blocks are being written."""
+        ...
+
+    def on(self) -> None:
+        """Record."""
+        ...
+
+    def off(self) -> None:
+        """End the part."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +63,7 @@ class RecordState:
 
 
 @contextmanager
-def followed(folder: Path | None, switch: RecordingSwitch | None) -> Iterator[None]:
+def followed(folder: Path | None, switch: Switch | None) -> Iterator[None]:
     """A context in which `record` can switch the recording of the run in this folder. Does nothing without a switch."""
     if folder is None or switch is None:
         yield
@@ -62,7 +84,9 @@ def followed(folder: Path | None, switch: RecordingSwitch | None) -> Iterator[No
                 (folder / name).unlink(missing_ok=True)
 
 
-def record(on: bool | None, run: PathLike | None = None, *, runs: PathLike = "runs") -> RecordState:
+def record(
+    on: bool | None, run: str | os.PathLike[str] | None = None, *, runs: str | os.PathLike[str] = "runs"
+) -> RecordState:
     """Switch the recording of a scan on or off that was begun with `record_on_request`, or ask for its state
     (`rig record`).
 
@@ -88,7 +112,7 @@ def record(on: bool | None, run: PathLike | None = None, *, runs: PathLike = "ru
     )
 
 
-def _follow(folder: Path, switch: RecordingSwitch, state: Any, over: threading.Event) -> None:
+def _follow(folder: Path, switch: Switch, state: Any, over: threading.Event) -> None:
     told: object = None
     seen = ""
     while not over.wait(LOOK_S):
