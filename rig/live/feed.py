@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DeviceError
-from rig.count.sweeps import SweepAccount, SweepData
+from rig.count.followed_row import FollowedRow, RowWish
+from rig.count.sweeps import SweepData
 from rig.count.volume import CountVolume
 from rig.devices.open import OpenRig
 from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
-from rig.geometry.windows import SweepGeometry
 from rig.live.slot import SlotWriter
 from rig.recording.replay import ENDLESS
 from rig.scan.counting import AcquiredMap
@@ -77,6 +77,10 @@ class Feed:
         self._progress: ScanProgress | None = None
         self._view: MonitorView | None = None
         self._sweep: SweepData | None = None
+        self._row: FollowedRow | None = None
+        """Counts of a row of the sweep that is about to be noted."""
+        self._followed: tuple[int, FollowedRow] | None = None
+        """Map, and counts of a row of its sweep, whose other counts were not kept."""
         self._map: AcquiredMap | None = None
         self._figures: tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]] | None = None
         self._map_times: deque[float] = deque(maxlen=_RATE_MAPS)
@@ -93,6 +97,7 @@ class Feed:
             monitor=_each(self._note_view, others.monitor),
             watched=(lambda: True) if others.monitor is not None else self._watched,
             sweeps=_each(self._note_sweep, others.sweeps),
+            row=RowWish(self._wanted_row, self._note_row),
             begun=_each(self.begin, others.begun),
             maps=_each(self.show_map, others.maps),
         )
@@ -120,7 +125,7 @@ class Feed:
         elif self._slot is not None:
             self._slot.close()
         self._written.clear()  # hundreds of megabytes must not wait for garbage collection
-        self._begun = self._view = self._sweep = self._map = None
+        self._begun = self._view = self._sweep = self._map = self._followed = None
 
     def __enter__(self) -> Self:
         """The feed itself."""
@@ -145,8 +150,16 @@ class Feed:
         self._view = view
 
     def _note_sweep(self, sweep: SweepData) -> None:
-        followed = self._watched() and self._slot is not None and self._slot.wanted_row is not None
-        self._sweep = sweep if followed else None
+        followed, row = self._wanted_row() is not None, self._row
+        self._sweep = sweep if followed and isinstance(sweep.tally, CountVolume) else None
+        self._followed = (sweep.index, row) if self._sweep is None and row is not None else None
+        self._row = None
+
+    def _wanted_row(self) -> int | None:
+        return self._slot.wanted_row if self._watched() and self._slot is not None else None
+
+    def _note_row(self, found: FollowedRow) -> None:
+        self._row = found
 
     def _begin(self, begun: RunBegun) -> None:
         self._begun = begun
@@ -187,12 +200,24 @@ class Feed:
             slot.write("map", *map_content(found, begun.rig.config.estimate.estimator))
         if self._figures and self._new("figures", self._figures):
             slot.write("figures", *self._figures)
-        row, sweep = slot.wanted_row, self._sweep
-        if row is None or sweep is None or not isinstance(sweep.tally, CountVolume):
-            return
-        if 0 <= row < begun.geometry.rows and (sweep.index, row) != self._shown_row:
-            self._shown_row = sweep.index, row
-            slot.write("row", *row_content(sweep, sweep.tally, row, begun.geometry))
+        self._publish_row(slot, begun)
+
+    def _publish_row(self, slot: SlotWriter, begun: RunBegun) -> None:
+        """Write the section `row` if it is of another map or image row than before: any row of a sweep whose counts
+        were kept, or the one that was followed."""
+        wanted, sweep, followed = slot.wanted_row, self._sweep, self._followed
+        kept = None if sweep is None or not isinstance(sweep.tally, CountVolume) else sweep.tally
+        if sweep is not None and kept is not None and wanted is not None:
+            if self._is_new_row(sweep.index, wanted, begun):
+                slot.write("row", *row_content(sweep.index, wanted, row_of(kept, wanted), begun))
+        elif followed is not None and self._is_new_row(followed[0], followed[1].row, begun):
+            counts, lines = followed[1].counts, begun.plan.lines
+            by_column = counts if lines is None else counts[lines.place]
+            slot.write("row", *row_content(followed[0], followed[1].row, by_column, begun))
+
+    def _is_new_row(self, index: int, row: int, begun: RunBegun) -> bool:
+        before, self._shown_row = self._shown_row, (index, row)
+        return 0 <= row < begun.geometry.rows and before != (index, row)
 
     def _new(self, section: str, value: object) -> bool:
         """Whether a section is to be written from this value; it is remembered."""
@@ -305,16 +330,22 @@ def map_content(found: AcquiredMap, estimator: str) -> tuple[dict[str, Any], dic
     return finite(header), camera | stripes
 
 
-def row_content(
-    sweep: SweepAccount, volume: CountVolume, row: int, geometry: SweepGeometry
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and arrays of the section `row`. begin_px, end_px: first pixel of the search window, and that after its
-    last one; no pixel is searched where begin_px >= end_px."""
+def row_of(volume: CountVolume, row: int) -> NDArray[np.uint16]:
+    """Counts of one row of a sweep, (columns, width or more), 0 outside the windows."""
     columns, _, window = volume.counts.shape
     counts = np.zeros((columns, int(volume.x0.max(initial=0)) + window), np.uint16)
     for column, first in enumerate(volume.x0.tolist()):
         counts[column, first : first + window] = np.minimum(volume.counts[column, row], np.uint32(_MOST_COUNT))
-    header = {"map": sweep.index, "row": row, "exposures": volume.exposures}
+    return counts
+
+
+def row_content(
+    index: int, row: int, counts: NDArray[np.uint16], begun: RunBegun
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Header and arrays of the section `row`, of map `index`. begin_px, end_px: first pixel of the search window, and
+    that after its last one; no pixel is searched where begin_px >= end_px."""
+    geometry = begun.geometry
+    header = {"map": index, "row": row, "exposures": begun.plan.exposures}
     windows = {"begin_px": geometry.x_lo[row], "end_px": geometry.x_hi[row] + 1}
     return header, {"counts": counts[:, : geometry.width], **windows}
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
+from rig.count.followed_row import add_row
 from rig.count.sweeps import FirstSweep, SweepAssembler
 from rig.count.volume import FrameTally
 from rig.depth.reconstruct import map_geometry
@@ -76,12 +77,7 @@ class MapRows:
         frames = self.frames(number)
         counts = np.zeros((len(frames.n_frames), plan.width), np.uint16)
         for bits, bins, x0 in frames.pieces:
-            pixels = np.unpackbits(bits[:, row], axis=1)
-            whole = pixels.shape[1] >= plan.width
-            for first in (0,) if whole else np.unique(x0):
-                of_it = bins >= 0 if whole else (bins >= 0) & (x0 == first)
-                window = counts[:, first : first + pixels.shape[1]]
-                _add_columns(window, bins[of_it], pixels[of_it, : window.shape[1]])
+            add_row(counts, bits[:, row], bins, x0)
         seen = geometry.x_lo[row] <= geometry.x_hi[row]
         begin, end = (np.where(seen, px, 0).astype(np.int32) for px in (geometry.x_lo[row], geometry.x_hi[row] + 1))
         if plan.lines is not None:
@@ -132,15 +128,6 @@ class MapRows:
         raise UsageError(
             f"the marker that ends map {number} of {self._recording.path} is gone; 'rig verify' tells more"
         )
-
-
-def _add_columns(window: NDArray[np.uint16], bins: NDArray[np.int32], pixels: NDArray[np.uint8]) -> None:
-    """Add pixels (n, width) to the rows of `window` that `bins` (n,) names: first over frames that follow one another
-    in the same column, since adding frame by frame takes fifty times as long."""
-    if not len(bins):
-        return
-    starts = np.flatnonzero(np.r_[True, bins[1:] != bins[:-1]])
-    np.add.at(window, bins[starts], np.add.reduceat(pixels, starts, axis=0, dtype=np.uint16))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,8 +18,9 @@ from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
 from drivers.replay.spad import ReplaySpad
 from drivers.transports.endpoints import EMULATED_PREFIX
+from rig.count.followed_row import RowFollower
 from rig.count.sweeps import FirstSweep, SweepAssembler
-from rig.count.volume import SweepLayout
+from rig.count.volume import SweepCounter, SweepLayout
 from rig.depth.fog_meter import FogEstimate
 from rig.depth.reconstruct import MakesMaps
 from rig.devices.open import OpenRig
@@ -127,6 +128,9 @@ class Acquisition:
         counter = self._maker.counter(
             SweepLayout(plan.columns, plan.rows, plan.width, plan.x0, plan.window, plan.exposures, plan.used_px)
         )
+        if self._listeners.row is not None and not isinstance(counter, SweepCounter):  # which keeps all rows
+            bins = plan.columns if plan.lines is None else plan.lines.places
+            counter = RowFollower(counter, self._listeners.row, bins, plan.width)
         done = 0
         while done < self._asked.maps:
             sweeps, begin = self._next_start(self._asked.maps - done)

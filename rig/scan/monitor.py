@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.frames import FrameBlock
 from drivers.ring import RingReader
+from rig.count.followed_row import RowWish
 from rig.count.sweeps import SweepData
 from rig.depth.fog_meter import FogEstimate
 from rig.devices.open import OpenRig
@@ -109,6 +110,7 @@ class Listeners:
     begun: called once, on the caller's thread, before anything is compiled or moves.
     maps: called with each map once it is written and counted, on the caller's thread.
     enough: called after `maps`; if it returns True, the run ends with this map.
+    row: the wish to follow an image row.
     """
 
     live: Callable[[ScanProgress], None] | None = None
@@ -119,6 +121,7 @@ class Listeners:
     begun: Callable[[RunBegun], None] | None = None
     maps: Callable[[AcquiredMap], None] | None = None
     enough: Callable[[AcquiredMap], bool] | None = None
+    row: RowWish | None = None
 
     def tell(self, now: ScanProgress) -> None:
         """Report to `rig.progress` and `live` how far a scan is."""

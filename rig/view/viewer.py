@@ -258,7 +258,6 @@ class _ShowsLive(_Shows):
         self._figures: list[health.Figure] = []
         self._align: list[health.Figure] = []
         self._state: LiveState | None = None
-        self._estimator = ""
         self._told_s = -np.inf
         self._parent = os.getppid() if hasattr(os, "getppid") else 0
         self._tell_setup({}, "waiting for a scan")
@@ -288,8 +287,6 @@ class _ShowsLive(_Shows):
         """The reason why the scan has not sent any."""
         if self._source.state is not LiveState.LIVE:
             return "the scan is over; the counts of its last map's rows went with it"
-        if self._estimator == "likelihood" and number:
-            return "likelihood judges columns as they come, and keeps no counts of rows after the first map"
         return "the counts of this row come with the next map"
 
     def _take(self, news: LiveNews, begun: bool) -> None:
@@ -332,9 +329,9 @@ class _ShowsLive(_Shows):
 
     def _tell_setup(self, setup: Mapping[str, Any], title: str) -> None:
         self.title = title
-        uncalibrated = ((setup.get("config") or {}).get("calibration", "") is None) if setup else False
+        calibration = (setup.get("config") or {}).get("calibration", "")
+        uncalibrated = calibration is None and setup.get("kind") != "align"
         notes = ["No depth: the rig is not calibrated (rig calibrate)."] if uncalibrated else []
-        self._estimator = str(setup.get("estimator") or "")
         told = {
             "live": True,
             "kind": setup.get("kind") or "live",

@@ -19,6 +19,7 @@ from rig import api
 from rig.live import feed as feed_module
 from rig.live.feed import Feed, finite, free_bytes
 from rig.live.slot import SlotReader, SlotWriter, Value
+from rig.recording.map_rows import MapRows
 from tests.system.small_rig import HEIGHT, WIDTH, emulated, write_rig
 
 PATIENCE_S = 60.0
@@ -137,6 +138,26 @@ def test_readers_get_the_run_its_frames_its_map_and_the_row_they_follow(
     frame = monitor["frame"][-1]
     assert frame.arrays["counts"].shape == (HEIGHT, WIDTH)
     assert frame.arrays["counts"].max() <= frame.header["frames"] <= 16
+
+
+def test_a_row_is_followed_also_where_columns_are_judged_as_they_come(
+    small: Path, tmp_path: Path, watched: Callable[..., Watcher]
+) -> None:
+    watcher = watched(row=20)
+
+    def slowly(now: object) -> None:
+        watcher.wait(lambda: watcher.values.get("status"))
+        time.sleep(0.05)
+
+    api.scan(small, maps=40, estimator="likelihood", out=tmp_path / "run", record=True, live=slowly)
+    watcher.wait(lambda: watcher.reader is None)
+    streamed = [row for row in watcher.values["row"] if row.header["map"] > 0]
+    assert streamed, [row.header for row in watcher.values["row"]]
+    recorded = MapRows(tmp_path / "run")
+    for row in streamed:
+        assert row.header["row"] == 20
+        np.testing.assert_array_equal(row.arrays["counts"], recorded.row(row.header["map"], 20).counts)
+    assert any(row.arrays["counts"].any() for row in streamed)
 
 
 def test_while_nobody_watches_nothing_is_copied_and_no_frame_is_summed(

@@ -1,0 +1,97 @@
+"""Counts of one image row beside those of a whole sweep, for people who watch a run.
+
+Estimators that judge a column as soon as it is complete keep no counts. One row is cheap: of 500 frames of 512 x 512
+pixels it takes a fifth of a millisecond, 4 % of their time at 100 kHz, and only while somebody follows a row.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.count.volume import Counter, FrameTally
+
+_LONG = 4
+"""Frames a column from which adding up column by column is faster than `reduceat`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowedRow:
+    """A row of one sweep. counts: uint16 (bins, width), how often each pixel fired over the frames of a bin; 0 outside
+    windows. Bins are columns or, with several lines, places of the mirror."""
+
+    row: int
+    counts: NDArray[np.uint16]
+
+
+class RowWish(NamedTuple):
+    """The wish to follow a row. wanted: called at the begin of each sweep; the row, or None. found: called with the row
+    of each sweep at its end, before the sweep's counts are used. Both are called on the counting thread."""
+
+    wanted: Callable[[], int | None]
+    found: Callable[[FollowedRow], None]
+
+
+class RowFollower:
+    """A `Counter` that hands frames on to another one, and counts the wanted row of them as well.
+
+    bins: number of columns, or of the mirror's places. width: of the sensor, in pixels.
+    """
+
+    def __init__(self, counter: Counter, wish: RowWish, bins: int, width: int) -> None:
+        self._counter, self._wish = counter, wish
+        self._shape = bins, width
+        self._followed: FollowedRow | None = None
+
+    def reset(self) -> None:
+        """Begin the next sweep."""
+        row = self._wish.wanted()
+        self._followed = None if row is None else FollowedRow(row, np.zeros(self._shape, np.uint16))
+        self._counter.reset()
+
+    def add(
+        self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
+    ) -> None:
+        """Add frames as in `Counter`."""
+        followed = self._followed
+        if followed is not None and 0 <= followed.row < bits.shape[1]:
+            add_row(followed.counts, bits[:, followed.row], bins, x0)
+        self._counter.add(bits, bins, column, x0)
+
+    def settle(self, under_way: int = 0) -> None:
+        """Wait as the other counter does; a row is counted at once."""
+        self._counter.settle(under_way)
+
+    def finish(self) -> FrameTally:
+        """The sweep as the other counter has counted it."""
+        if self._followed is not None:
+            self._wish.found(self._followed)
+            self._followed = None
+        return self._counter.finish()
+
+
+def add_row(
+    counts: NDArray[np.uint16], bits: NDArray[np.uint8], bins: NDArray[np.int32], x0: NDArray[np.int32]
+) -> None:
+    """Add one row of packed frames, bits (n, row bytes), to the counts (bins, width) of their bins (n,).
+
+    Bins below 0 are no columns. x0: (n,), first pixel of each frame's row, if it is shorter than the sensor's.
+    """
+    if not len(bits):
+        return
+    pixels = np.unpackbits(bits, axis=1)
+    whole = pixels.shape[1] >= counts.shape[1]
+    first = np.zeros_like(x0) if whole else x0
+    # Frames of a column follow one another: they are added up first.
+    begins = np.flatnonzero(np.diff(bins, prepend=-9) | np.diff(first, prepend=first[:1]))
+    if len(pixels) >= _LONG * len(begins):
+        ends = (*begins[1:].tolist(), len(pixels))
+        sums = [pixels[a:b].sum(axis=0, dtype=np.uint16) for a, b in zip(begins.tolist(), ends, strict=True)]
+    else:
+        sums = list(np.add.reduceat(pixels, begins, axis=0, dtype=np.uint16))
+    for column, at, summed in zip(bins[begins].tolist(), first[begins].tolist(), sums, strict=True):
+        if column >= 0:
+            window = counts[column, at : at + pixels.shape[1]]
+            window += summed[: len(window)]
