@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.count import followed_row
 from rig.count.followed_row import FollowedRow, RowFollower, RowWish, add_row
+from tests.stability.inventory import covers
+
+covers(followed_row)
 
 WIDTH, COLUMNS = 128, 12
 
