@@ -9,7 +9,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
 
 from drivers.optional_packages import install_command
@@ -18,6 +20,8 @@ from rig.requests import ViewRequest
 
 READY_S: Final = 20.0
 """Longest wait for the page: loading what it needs takes some two seconds, on a busy machine more."""
+NICE: Final = 10
+"""Niceness of the page's session: a tenth of the share of the run, while both want the processors."""
 _LOOK_S = 0.05
 
 
@@ -44,6 +48,9 @@ def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.P
         stdout=subprocess.DEVNULL,
         start_new_session=True,
     )
+    # Linux shares the processors among sessions first: the page's own niceness would count within its session only.
+    with suppress(OSError):
+        Path(f"/proc/{process.pid}/autogroup").write_text(str(NICE))
     _wait(lambda: process.poll() is not None or _listens(port))
     return process
 

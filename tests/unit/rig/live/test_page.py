@@ -1,5 +1,6 @@
 """The process with the live page: it is started for a run, waited for, and ended."""
 
+import os
 import socket
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import pytest
 
 from rig.errors import UsageError
 from rig.live import page as page_module
-from rig.live.page import end_page, page_problem, start_page
+from rig.live.page import NICE, end_page, page_problem, start_page
 
 
 @pytest.fixture
@@ -43,6 +44,9 @@ def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, m
     try:
         with socket.create_connection(("127.0.0.1", port), 1):
             assert program.read_text() == f"view --live --port {port}{more}"
+        group = Path(f"/proc/{page.pid}/autogroup")
+        assert not group.exists() or group.read_text().split()[-1] == str(NICE)
+        assert os.getsid(page.pid) != os.getsid(0)
     finally:
         end_page(page)
     assert page.poll() is not None
