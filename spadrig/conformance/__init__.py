@@ -1,7 +1,7 @@
 """Conformance suites: the tests that every device and estimator must pass, for packages that add their own.
 
 Input: a class of tests in your package that inherits a suite, and a fixture that gives it your device. Output: pytest's
-verdict. `plugin` is a plug-in of pytest, which the extra `testing` brings. docs/how-to/plugin.md shows an example.
+verdict. `spadrig.pytest_plugin` has the default fixtures. docs/how-to/plugin.md shows an example.
 """
 
 from spadrig.conformance.beam_scanner import BeamScannerSuite

@@ -159,7 +159,9 @@ class EstimatorSuite:
         lit = np.repeat(-np.expm1(-flux(geometry)), exposures, axis=0)
         frames = np.packbits(generator.random(lit.shape) < lit, axis=2)  # the width is a multiple of 64 bits
         bins = np.repeat(np.arange(COLUMNS, dtype=np.int32), exposures)
-        place = np.repeat(np.arange(float(COLUMNS)), exposures) + np.tile((np.arange(exposures) + 0.5) / exposures - 0.5, COLUMNS)
+        place = np.repeat(np.arange(float(COLUMNS)), exposures) + np.tile(
+            (np.arange(exposures) + 0.5) / exposures - 0.5, COLUMNS
+        )
         for _ in range(2):
             counter.reset()
             for first in range(0, len(frames), 7):

@@ -112,3 +112,13 @@ def test_the_suites_find_a_laser_that_stays_on_a_shifted_estimator_and_a_forgott
     assert "FAILED test_wrong.py::TestShifted::test_a_clear_stripe_is_found_and_believed" in said
     assert "write a fixture 'sync' that yields a spadrig.conformance.SyncCase; see docs/how-to/plugin.md" in said
     assert "+  where True = " in said  # assertions of the suites are told in detail
+
+
+def test_pytest_loads_the_plug_in_without_anything_of_the_project(tmp_path: Path) -> None:
+    (tmp_path / "test_other.py").write_text(
+        "import sys\n\n\ndef test_other():\n"
+        "    assert 'spadrig.pytest_plugin' in sys.modules\n"
+        "    assert not {'numpy', 'drivers', 'rig', 'spadrig.conformance'} & set(sys.modules)\n"
+    )
+    ended = run_pytest(Path(sys.executable), tmp_path, "-W", "error", "-p", "no:hypothesispytest", "test_other.py")
+    assert ended.returncode == 0, ended.stdout

@@ -1,6 +1,7 @@
 """The plug-in of pytest: default fixtures of the conformance suites, and detailed messages of their failed assertions.
 
 A package gives the suites its devices by fixtures of these names. Without one, the fixture here says what to write.
+pytest loads this module in every run, whatever is tested, so it imports nothing of the project.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-if TYPE_CHECKING:  # pytest loads this module in every run, whatever is tested
+if TYPE_CHECKING:
     from spadrig.conformance.cases import SpadCase, Taken
 
 pytest.register_assert_rewrite(
