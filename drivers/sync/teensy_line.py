@@ -22,7 +22,7 @@ USB_IDS = (0x16C0, 0x0483)
 REPLY_S = 1.0
 """Deadline for a reply. One over USB takes 1 ms; the rest is a margin for a busy host."""
 EMULATED_REPLY_S = 4.0
-"""The same for an emulated board, whose thread competes with everything else on this machine."""
+"""Deadline for a reply of an emulated board. Its thread competes with everything else on this machine."""
 OPENING = 3
 """The first reply may take this many times as long: a host that starts a scan is busy."""
 TRIES = 3
