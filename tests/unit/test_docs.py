@@ -213,6 +213,7 @@ def test_a_line_that_the_command_line_refuses_is_found(line: str, problem: str) 
     assert problem in (refused(shlex.split(line), is_whole=True) or "")
 
 
+@cache
 def anchors(page: Path) -> set[str]:
     """What the headings of a page are linked by."""
     headings = re.findall(r"^#+ (.*)$", fill(page.read_text()), re.M)
