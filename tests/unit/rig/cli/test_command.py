@@ -13,10 +13,10 @@ from rig.cli.main import app
 
 ROOT = Path(__file__).parents[4]
 WHOLE_COMMANDS = {
-    "rig/api/report.py", "rig/plan/calibration_reach.py", "rig/recording/inputs.py", "rig/recording/open.py",
-    "rig/report/run_settings.py",
+    "rig/api/report.py", "rig/live/page.py", "rig/plan/calibration_reach.py", "rig/recording/inputs.py",
+    "rig/recording/open.py", "rig/report/run_settings.py",
 }  # fmt: skip
-"""Modules whose messages hold a command line that can be copied, such as `rig reconstruct RUN --out DIR`."""
+"""Modules with a whole command line: in a message to be copied, such as `rig reconstruct RUN --out DIR`, or to run."""
 
 
 def texts() -> Iterator[tuple[str, str]]:
