@@ -81,7 +81,10 @@ def _order(version: str) -> tuple[int, ...]:
 
 def running(python: str) -> str:
     """The version of an interpreter; empty if it does not run."""
-    shown = subprocess.run([python, "-c", "import platform; print(platform.python_version())"], capture_output=True)
+    try:
+        shown = subprocess.run([python, "-c", "import platform; print(platform.python_version())"], capture_output=True)
+    except OSError:
+        return ""
     return shown.stdout.decode().strip() if shown.returncode == 0 else ""
 
 
