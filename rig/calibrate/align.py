@@ -27,7 +27,7 @@ from rig.count.volume import Counter, CountVolume, FrameTally, SweepLayout
 from rig.depth.reconstruct import MapResult, Reconstructor, map_geometry
 from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.devices.prepare import prepare
-from rig.errors import PlanError, UsageError
+from rig.errors import DevicesError, PlanError, UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.live.feed import Feed
 from rig.recording.replay import ENDLESS
@@ -217,6 +217,8 @@ def _aligned(
                         break
         except KeyboardInterrupt:  # its usual end
             pass
+        if acquisition.trouble:
+            raise DevicesError("\n".join(acquisition.trouble))
     return Alignment(settings.name, last)
 
 

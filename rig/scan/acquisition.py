@@ -103,7 +103,8 @@ class Acquisition:
         self._frames_before = 0
         self._fog: FogEstimate | None = None
         self.trouble: list[str] = []
-        """Lines on devices that could not be made safe, if the caller took no more maps and so got no error."""
+        """Lines on devices that could not be made safe. A caller that takes no more maps, or for whom an interrupt is
+        the usual end, gets no error that says so, and has to look here."""
 
     @property
     def counters(self) -> SpadCounters:
@@ -217,9 +218,6 @@ class Acquisition:
                 raise failure
             if trouble:
                 raise DevicesError("\n".join(trouble))
-        except GeneratorExit:
-            self.trouble = trouble
-            raise
         except BaseException as error:
             if not isinstance(error, DevicesError):
                 for line in trouble:
@@ -299,7 +297,7 @@ class Acquisition:
         """Set the gate low, take no more frames, pause the laser, park the mirror and stop the SPAD, in this order,
         whatever fails; returns a line for each failure. An interrupt meanwhile is raised at the end."""
         rig = self._rig
-        trouble: list[str] = []
+        self.trouble = trouble = []
         interrupted: BaseException | None = None
         steps: tuple[tuple[str, Callable[[], None]], ...] = (
             ("gate", rig.sync.abort),

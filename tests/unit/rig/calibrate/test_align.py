@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.errors import DeviceFault
 from drivers.interfaces import LineLaser
 from rig import api
 from rig.calibrate.align import AlignFigures, Alignment, LineLook, line_width_px, row_rates
 from rig.count.volume import CountVolume
-from rig.errors import UsageError
+from rig.errors import DevicesError, UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.live.slot import SlotReader, Value
 from tests.system.small_rig import HEIGHT, WIDTH, emulated, write_rig
@@ -173,6 +174,26 @@ def test_the_page_gets_figures_profile_and_sum_image(tmp_path: Path) -> None:
     assert values["figures"].header["power_w"] == aligned[0].last.power_w
     assert values["map"].arrays["intensity"].shape == (HEIGHT, WIDTH)
     assert values["map"].arrays["intensity"].any()
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_a_laser_that_does_not_go_off_at_once_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupted: bool
+) -> None:
+    pause, failures = LineLaser.pause, [DeviceFault("it does not answer")]
+
+    def stuck(self: LineLaser) -> None:
+        if failures:  # the laser's close pauses it again
+            raise failures.pop()
+        pause(self)
+
+    def interrupt(figures: AlignFigures) -> None:
+        if interrupted:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LineLaser, "pause", stuck)
+    with pytest.raises(DevicesError, match="laser: it does not answer"):
+        api.align(write_rig(tmp_path / "small"), seconds=0.01, tell=interrupt)
 
 
 def test_emulated_wires_are_aligned_too(tmp_path: Path) -> None:
