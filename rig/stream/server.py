@@ -78,6 +78,7 @@ class DepthServer:
         self._changed = threading.Condition()
         self._over = threading.Event()
         self._clients: set[socket.socket] = set()
+        self._served = 0
         family = socket.AF_INET6 if ":" in access.address else socket.AF_INET
         self._listening = socket.socket(family, socket.SOCK_STREAM)
         try:
@@ -128,7 +129,7 @@ class DepthServer:
                     continue
                 with SlotReader.open(slot.path) as reader:
                     self._follow_scan(reader)
-            except (OSError, UsageError) as error:  # the scan ended meanwhile
+            except (OSError, UsageError, KeyError) as error:  # the scan ended meanwhile, or is of another version
                 _log.debug("cannot read the running scan: %s", error)
                 self._over.wait(LOOK_S)
 
@@ -175,37 +176,38 @@ class DepthServer:
             threading.Thread(target=self._serve, args=(client,), name="stream client", daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
-        with client, suppress(OSError):  # of which a client that goes away is one
+        with client, suppress(OSError), self._connected(client):  # of which a client that goes away is one
             client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            client.settimeout(HELLO_S)
-            with self._counted(client) as room:
-                why, hello = "", None
-                try:
-                    hello = read_hello(_first_line(client))
-                    why = "" if self._knows(hello) else "the token is missing or wrong; 'rig stream' prints it"
-                except ValueError as error:
-                    why = str(error)
-                if not room:
+            why, hello = "", None
+            try:
+                hello = read_hello(_first_line(client))
+                why = "" if self._knows(hello) else "the token is missing or wrong; 'rig stream' prints it"
+            except ValueError as error:
+                why = str(error)
+            with self._changed:  # only who has the token takes room
+                if not why and self._served >= MOST_CLIENTS:
                     why = f"{MOST_CLIENTS} clients are connected; close one"
-                if why or hello is None:
-                    with self._changed:
-                        self.counts.refused += 1
-                    _send(client, message(MessageKind.ERROR, {"error": why}))
-                    return
+                self._served += not why
+                self.counts.clients += not why
+                self.counts.refused += bool(why)
+            if why or hello is None:
+                _send(client, message(MessageKind.ERROR, {"error": why}))
+                return
+            try:
                 client.settimeout(STUCK_S)
-                with self._changed:
-                    self.counts.clients += 1
                 self._send_news(client, hello)
+            finally:
+                with self._changed:
+                    self._served -= 1
 
     @contextmanager
-    def _counted(self, client: socket.socket) -> Iterator[bool]:
-        """Whether there is room for one more client, which counts within the context."""
+    def _connected(self, client: socket.socket) -> Iterator[None]:
+        """A context in which the server's end closes a connection."""
         with self._changed:
-            room = len(self._clients) < MOST_CLIENTS
             self._clients.add(client)
         try:
-            yield room
+            yield
         finally:
             with self._changed:
                 self._clients.discard(client)
@@ -262,8 +264,10 @@ def serve(request: StreamRequest, *, ready: Callable[[DepthServer], None] | None
 
 
 def _first_line(client: socket.socket) -> bytes:
-    line = b""
+    """What a client sends until a line ends, within HELLO_S altogether. Raises OSError if it takes longer."""
+    line, ends_s = b"", time.monotonic() + HELLO_S
     while b"\n" not in line and len(line) <= MOST_HELLO:
+        client.settimeout(max(ends_s - time.monotonic(), 1e-3))  # 0 would mean: do not wait
         piece = client.recv(MOST_HELLO)
         if not piece:
             break

@@ -171,6 +171,32 @@ def test_clients_that_hang_flood_or_go_away_harm_no_other(slot: SlotWriter, serv
     flood.close()
 
 
+def test_strangers_that_drip_a_first_line_take_no_room_and_are_dropped(
+    slot: SlotWriter, server: DepthServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "MOST_CLIENTS", 1)
+    monkeypatch.setattr(server_module, "HELLO_S", 0.5)
+    dripping = socket.create_connection(server.address, timeout=PATIENCE_S)
+    with closing(Client(server)) as good:
+        good.until(lambda message: message.kind == 1)
+    ends = time.monotonic() + PATIENCE_S
+    with suppress(ConnectionError):
+        while time.monotonic() < ends:
+            dripping.sendall(b" ")
+            time.sleep(0.05)
+    assert time.monotonic() < ends, "as long as it drips"
+    dripping.close()
+
+
+def test_a_scan_of_another_version_does_not_end_the_stream(server: DepthServer) -> None:
+    with SlotWriter.create("scan", "newer", {"setup_2": 1 << 10}) as writer, closing(Client(server)) as client:
+        client.until(lambda message: message.about.get("state") == "live")
+        assert writer.watched
+    with SlotWriter.create("scan", "lab", CAPACITIES) as writer, closing(Client(server)) as client:
+        set_up(writer)
+        assert client.until(lambda message: message.kind == 1).about["name"] == "lab"
+
+
 def test_the_end_of_a_scan_is_told_and_the_next_one_is_followed(server: DepthServer) -> None:
     with closing(Client(server)) as client:
         assert client.until(lambda message: message.kind == 3).about["state"] == "waiting"
