@@ -13,8 +13,9 @@ from rig.errors import UsageError
 from rig.report.calibration import calibration_report
 from rig.report.page import is_report
 from rig.report.run import run_report
-from rig.report.run_facts import is_run, read_run
+from rig.report.run_facts import read_run
 from rig.run_folder.disk import replace_file
+from rig.run_folder.runs import is_run
 from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
 
 _WHAT: Final = "name the folder of a run, a calibration or a trade-off, or a calibration.yaml"

@@ -88,13 +88,6 @@ class RunFacts:
         return float(value) if isinstance(value, int | float) else 0.0
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run: it has a manifest, a summary beside maps, or frames."""
-    return any((folder / name).exists() for name in (MANIFEST, INDEX_FILE)) or (
-        (folder / SUMMARY).exists() and (folder / "stripe").is_dir()
-    )
-
-
 def read_run(folder: Path, number: int | None = None) -> RunFacts:
     """Read a run, with one of its maps. number: of the map; None: the last one.
 

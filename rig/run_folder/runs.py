@@ -106,7 +106,7 @@ def _passes(entry: RunEntry, request: RunsRequest, since: datetime | None) -> bo
 
 def _runs_below(folder: Path, depth: int) -> Iterator[Path]:
     """Folders with a run. What lies in a run is not looked at; nor are hidden folders and links."""
-    if _is_run(folder):
+    if is_run(folder):
         yield folder
         return
     if depth == 0:
@@ -120,7 +120,8 @@ def _runs_below(folder: Path, depth: int) -> Iterator[Path]:
             yield from _runs_below(part, depth - 1)
 
 
-def _is_run(folder: Path) -> bool:
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run: it has a manifest, a summary beside maps, or frames."""
     return any((folder / name).exists() for name in (MANIFEST, INDEX_FILE)) or (
         (folder / SUMMARY).exists() and (folder / "stripe").is_dir()
     )

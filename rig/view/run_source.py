@@ -22,7 +22,7 @@ from rig.recording.inputs import holds_frames_alone, reconstruct_line
 from rig.recording.map_rows import MapRows, RowCounts
 from rig.recording.open import open_recording, require_recording
 from rig.run_folder.manifest import read_manifest
-from rig.run_folder.pictures import POINT
+from rig.run_folder.pictures import ply_points
 from rig.scan.monitor import add_frames
 from rig.simd import Float32
 from rig.view.shown import ShownMap, at_pixels
@@ -166,7 +166,7 @@ def read_map(folder: Path, number: int, rays: tuple[Float32, Float32] | None, ab
     ply = _bytes(folder, "cloud", number, ".ply")
     counts: Float32 | None = None
     known = np.isfinite(depth_m)
-    found = None if ply is None else _ply_points(ply)
+    found = None if ply is None else ply_points(ply)
     if found is not None and len(found) == np.count_nonzero(known):
         counts = np.full(depth_m.shape, np.nan, np.float32)
         counts[known] = found["intensity"]
@@ -201,10 +201,3 @@ def _worth(folder: Path, number: int, shape: tuple[int, ...]) -> dict[str, Float
     file = folder / "confidence" / f"{number:06d}.npz"
     arrays = load(file, load_arrays) if file.exists() else {}
     return {name: array.astype(np.float32) for name, array in arrays.items() if array.shape == shape}
-
-
-def _ply_points(ply: bytes) -> NDArray[np.void] | None:
-    """Points of a file that `ply_bytes` made; None if it is another one."""
-    header, end, body = ply.partition(b"end_header\n")
-    whole = bool(end) and b"binary_little_endian" in header and len(body) % POINT.itemsize == 0
-    return np.frombuffer(body, POINT) if whole else None

@@ -13,7 +13,8 @@ from rig.errors import UsageError
 from rig.report.page import MOST_BYTES
 from rig.report.run import run_report
 from rig.report.run_facts import ROWS as SHOWN_ROWS
-from rig.report.run_facts import is_run, read_run
+from rig.report.run_facts import read_run
+from rig.run_folder.runs import is_run
 from tests.unit.rig.report.pages import COLUMNS, ROWS, WIDTH, calibration_file, made_run, words_of
 
 
