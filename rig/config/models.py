@@ -129,8 +129,8 @@ class ScanConfig(ConfigSection):
         tuple[Command, Command],
         AfterValidator(_two_ends),
         Field(
-            description="mirror drive at the outer edges of the first and the last column; may run downward. Run-in and "
-            "run-out need room beyond it",
+            description="mirror drive at the outer edges of the first and the last column; may run downward. Run-in "
+            "and run-out need room beyond it",
             examples=["[-0.9, 0.9]"],
         ),
     ] = (-0.9, 0.9)

@@ -4,10 +4,10 @@
     python -m tests.reference.house --details circles words
     python -m tests.reference.house --limits        # part of `make test`
 
-Product code is `drivers`, `calibration`, `sim_backend`, `rig` and `spadrig`; sources are read, never imported. A package
-face, an `__init__.py` of docstring and imports only, counts as a module, but not as one of its folder's. With --limits each
-limit that is not kept is told; the exit code is 1 where one is broken that must hold. The goals, those of lines, are
-told as 'short by N' and do not fail.
+Product code is `drivers`, `calibration`, `sim_backend`, `rig` and `spadrig`; sources are read, never imported. A
+package face, an `__init__.py` of docstring and imports only, counts as a module, but not as one of its folder's. With
+--limits each limit that is not kept is told; the exit code is 1 where one is broken that must hold. The goals, those of
+lines, are told as 'short by N' and do not fail.
 """
 
 from __future__ import annotations
