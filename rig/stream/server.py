@@ -264,7 +264,7 @@ def serve(request: StreamRequest, *, ready: Callable[[DepthServer], None] | None
 
 
 def _first_line(client: socket.socket) -> bytes:
-    """What a client sends until a line ends, within HELLO_S altogether. Raises OSError if it takes longer."""
+    """The first line that a client sends, read within HELLO_S altogether. Raises OSError if it takes longer."""
     line, ends_s = b"", time.monotonic() + HELLO_S
     while b"\n" not in line and len(line) <= MOST_HELLO:
         client.settimeout(max(ends_s - time.monotonic(), 1e-3))  # 0 would mean: do not wait
