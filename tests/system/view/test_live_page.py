@@ -170,6 +170,15 @@ def test_stop_asks_once_more_and_then_the_scan_is_told(live: Served, open_tab: O
         wait_for(tab, slot, "latest.notice && latest.notice.text.includes('asked to stop')")
 
 
+def test_the_question_whether_to_stop_goes_with_its_scan(live: Served, open_tab: Open) -> None:
+    with scanning() as slot:
+        tab = open_tab(live.url)
+        wait_for(tab, slot, "!document.getElementById('stop').disabled")
+        tab.page.click("#stop")
+        assert tab.page.is_visible("#do-stop")
+    tab.until("latest.state.state === 'ended' && !document.getElementById('really').open")
+
+
 def test_the_last_map_stays_when_the_scan_ends(live: Served, open_tab: Open) -> None:
     with scanning() as slot:
         tab = open_tab(live.url)
