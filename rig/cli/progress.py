@@ -110,8 +110,8 @@ def progress(*, compiles: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _announced(line: ProgressLine) -> Iterator[None]:
-    """A context in which each part, and each stage outside parts, is printed once. Nothing is printed before
-    `PATIENCE_S` have passed.
+    """A context in which each part, and each stage outside parts, is printed once, and compiling once in each stage:
+    where it takes minutes, no other stage must seem to. Nothing is printed before `PATIENCE_S` have passed.
     """
     lock, said, speaks = threading.Lock(), set[str](), PATIENCE_S <= 0
 
@@ -119,7 +119,8 @@ def _announced(line: ProgressLine) -> Iterator[None]:
         nonlocal speaks
         with lock:
             speaks = speaks or begin
-            key = line.step.part if line.step.part and line.stage != COMPILING else line.stage
+            step, stage = line.step, line.stage
+            key = stage + step.stage if stage == COMPILING else step.part or stage
             if speaks and key not in said:
                 said.add(key)
                 print(f"{line.clock} {line.text()}", file=sys.stderr, flush=True)

@@ -38,11 +38,14 @@ def open_recording(folder: Path) -> RunRecording:
         raise DamagedRecordingError(str(error)) from None
 
 
-def require_recording(path: Path) -> None:
-    """Raise UsageError if a path is no folder with a recording, or zstandard is missing for a compressed one."""
+def require_recording(path: Path, wanted: str = "a run taken with `record`") -> None:
+    """Raise UsageError if a path is no folder with a recording, or zstandard is missing for a compressed one.
+
+    wanted: whose folder the message asks for.
+    """
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:
-        raise UsageError(f"{path} {_instead(path)}")
+        raise UsageError(f"{path} {_instead(path, f'name the folder of {wanted}')}")
     if any(file.name.endswith(PACKED_SUFFIX) for file in files):
         try:
             zstandard_or_error()
@@ -50,9 +53,8 @@ def require_recording(path: Path) -> None:
             raise UsageError(f"{path}: {error}") from None
 
 
-def _instead(path: Path) -> str:
+def _instead(path: Path, name_one: str) -> str:
     """Say what a path without a recording is, and what to do next."""
-    name_one = "name the folder of a run taken with `record`"
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
     if not path.exists():

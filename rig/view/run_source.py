@@ -45,7 +45,7 @@ class RunSource:
         self.folder = folder
         self._maps = MapFiles(folder)
         if not self._maps.indices:
-            require_recording(folder)
+            require_recording(folder, wanted="a run with maps or a recording")
         self.manifest: Mapping[str, Any] = {}
         self.notes: list[str] = []
         try:

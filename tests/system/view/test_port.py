@@ -300,7 +300,7 @@ def test_without_viser_the_command_names_what_to_install(scanned: Path) -> None:
     [
         ([], "rig view got neither a run nor --live; name the folder of a run, or --live for the running scan"),
         (["there", "--live"], "rig view got both a run and --live; name the folder of a run, or --live for the"),
-        (["nowhere"], "nowhere does not exist; name the folder of a run taken with --record"),
+        (["nowhere"], "nowhere does not exist; name the folder of a run with maps or a recording"),
         (["--live", "--token", "x"], "--token has 1 characters; it needs at least 16"),
         (["--live", "--view-rate", "11"], "--view-rate is 11 a second; it must be above 0 and at most 10"),
         (["--live", "--view-points", "0"], "--view-points is 0; it must be at least 1 and at most 250000"),

@@ -96,6 +96,19 @@ def test_without_a_terminal_each_stage_is_one_line_however_often_it_is_told(impa
     ]
 
 
+def test_without_a_terminal_compiling_is_said_again_in_each_later_stage(impatient, capsys):
+    with progress():
+        for _ in range(3):
+            with compiling():
+                pass
+        tell_stage("joint")
+        for _ in range(3):
+            with compiling():
+                pass
+        tell_stage("rendering")
+    assert stages(capsys.readouterr().err) == [COMPILING, "joint", COMPILING, "rendering"]
+
+
 def test_while_it_compiles_no_other_stage_is_claimed():
     line = ProgressLine()
     line.compiler_began()
