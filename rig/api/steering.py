@@ -53,6 +53,7 @@ class Steering:
         self._on_map = on_map
         self._config = config
         self._request = request
+        self._out = request.out
         self._taken = 0
         self._maps = request.maps or 1
         self._changes: Mapping[str, Any] | None = None
@@ -90,7 +91,7 @@ class Steering:
             raise
         follows = {"folder": None if result.folder is None else str(result.folder), "changes": dict(changes)}
         self._config = config
-        self._request = replace(self._request, maps=left, out=_next_folder(self._request.out))
+        self._request = replace(self._request, maps=left, out=_next_folder(self._out))
         return config, self._request, {"follows": follows}
 
 
@@ -113,10 +114,9 @@ def note(error: BaseException, result: RunResult) -> None:
 
 
 def _next_folder(out: Any) -> Path | None:
-    """The folder of the next scan: NAME-2, NAME-3, ... as far as these are free."""
+    """The folder of the next scan of a call whose first one is in `out`: NAME-2, NAME-3, ... as far as these are
+    free."""
     if out is None:
         return None
-    name, dash, number = Path(out).name.rpartition("-")
-    stem, first = (name, int(number) + 1) if dash and number.isdecimal() and int(number) > 1 else (Path(out).name, 2)
-    beside = (Path(out).with_name(f"{stem}-{each}") for each in count(first))
+    beside = (Path(out).with_name(f"{Path(out).name}-{each}") for each in count(2))
     return next(path for path in beside if not path.exists())

@@ -71,7 +71,9 @@ def test_changed_scans_are_recorded_one_by_one_and_played(small: Path, tmp_path:
     def steer(seen: SeenMap) -> Mapping[str, Any] | None:
         return {"exposures": 6} if seen.number == 1 else None
 
-    result = api.scan(small, maps=3, record=True, out=tmp_path / "run", on_map=steer)
+    named = "20251129-101500"  # as `rig scan` names folders; what is behind the dash is no number of scans
+    result = api.scan(small, maps=3, record=True, out=tmp_path / named, on_map=steer)
+    assert result.folder == tmp_path / f"{named}-2"
     for run in (*result.earlier, result):
         assert run.folder is not None
         assert api.verify(run.folder).exit_code == 0
