@@ -56,7 +56,7 @@ def report(
         runs = [read_run(each, map) for each in ([folder] if second is None else [folder, second])]
         kind = "run" if second is None else "runs"
         text = run_report(runs)
-        missing = tuple(line for each in runs for line in each.missing)
+        missing = tuple(line if second is None else f"{each.folder}: {line}" for each in runs for line in each.missing)
     elif kind == "calibration":
         text = _calibration(folder)
     else:

@@ -73,6 +73,8 @@ def _instead(path: Path, name_one: str) -> str:
             f"holds no recording ({SEGMENTS}): the frames of this run were not recorded; take it again with "
             "'rig scan --record'"
         )
+    if (path.parent / MANIFEST).exists():
+        return f"is a folder inside a run; name {path.parent}"
     for suffix, kind in ((".npy", "photoncube"), (".bin", "swissspad2 (or pi-imaging)")):
         if any(path.glob(f"*{suffix}")):
             return (

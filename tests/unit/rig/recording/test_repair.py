@@ -252,6 +252,14 @@ def test_a_folder_without_a_recording_is_called_what_it_is(tmp_path: Path, files
             act(tmp_path / "absent" if files is None else tmp_path)
 
 
+def test_of_a_folder_inside_a_run_the_run_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run" / "depth").mkdir(parents=True)
+    (tmp_path / "run" / "manifest.json").touch()
+    (tmp_path / "run" / "depth" / "000000.npy").touch()
+    with pytest.raises(UsageError, match=r"depth is a folder inside a run; name .*run$"):
+        verify(tmp_path / "run" / "depth")
+
+
 def test_a_recording_with_a_similar_name_beside_one_that_is_not_there_is_named(tmp_path: Path, runs: Runs) -> None:
     record(tmp_path / "street", runs[:1])
     (tmp_path / "strett").mkdir()  # holds nothing
