@@ -67,7 +67,10 @@ class Steering:
             return False
         try:
             seen = SeenMap(number, left, found.result, found.sweep, found.taken, self._config)
-            self._changes = self._on_map(seen) or None
+            said: Any = self._on_map(seen)
+            if not isinstance(said, Mapping | None):
+                raise UsageError(f"on_map returned {said!r}; return None or a dictionary of settings")
+            self._changes = said or None
         except Exception as error:  # of the caller's code: the maps so far are kept
             self._error = error
         return left > 0 and (self._changes is not None or self._error is not None)

@@ -18,7 +18,7 @@ from rig.depth.depth import DepthMap, depth_map, share_claims
 from rig.depth.floating import floating_points
 from rig.depth.fog_meter import FogEstimate, read_fog
 from rig.errors import UsageError
-from rig.estimate.registry import LEARNING, Learned, ManyMaps, create_estimator, is_coupled, recalling
+from rig.estimate.registry import ESTIMATORS, LEARNING, Learned, ManyMaps, create_estimator, is_coupled, recalling
 from rig.geometry.line_grid import LineGrid
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry, sweep_geometry, uncalibrated_geometry
@@ -119,7 +119,8 @@ class Reconstructor:
         self._min_confidence = estimate.min_confidence
         self._keep_floating = estimate.keep_floating
         self._filter = estimate.filter
-        self._coupled = is_coupled(estimate.estimator)
+        self._name = estimate.estimator
+        self._coupled = is_coupled(self._name)
         self._lines = lines
         threads = estimate.threads or os.cpu_count() or 1
         self._workers = RowWorkers(threads)
@@ -154,7 +155,12 @@ class Reconstructor:
         sweep: the result of a `counter`, or a `CountVolume`.
         """
         begun = time.perf_counter()
-        stripe = self.estimator.estimate(sweep, self.geometry)
+        try:
+            stripe = self.estimator.estimate(sweep, self.geometry)
+        except Exception as error:
+            if self._name not in ESTIMATORS:
+                error.add_note(f"raised by the estimator {self._name} of another package: tell its authors")
+            raise
         return self.complete(stripe, sweep, self._filter, time.perf_counter() - begun)
 
     def lanes(self) -> list[Lane]:
@@ -194,7 +200,12 @@ class Reconstructor:
     ) -> MapResult:  # fmt: skip
         """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread."""
         begun = time.perf_counter() - estimate_s
-        geometry, fog, intensity = self._bound(sweep), self._fog(sweep, stripe, used), sweep.intensity(workers)
+        geometry = self._bound(sweep)
+        if self._name not in ESTIMATORS and (problem := stripe.problem(geometry.rows, geometry.columns)):
+            raise UsageError(
+                f"estimator {self._name} gives {problem}; correct it: docs/how-to/plugin.md says what it owes"
+            )
+        fog, intensity = self._fog(sweep, stripe, used), sweep.intensity(workers)
         doubts, stripe = self._checks.check(sweep, intensity, stripe)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)

@@ -38,6 +38,17 @@ class StripeTable:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
+    def problem(self, rows: int, columns: int) -> str | None:
+        """The first array that is not float32 of shape (rows, columns), in words; None if all are."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        for name, value in values.items():
+            if value is None and name in ("x2_px", "confidence2"):
+                continue
+            kind, shape = getattr(value, "dtype", type(value).__name__), getattr(value, "shape", ())
+            if kind != np.float32 or shape != (rows, columns):
+                return f"{name} as {kind} {shape}, which must be float32 ({rows}, {columns})"
+        return None
+
     @classmethod
     def empty(cls, rows: int, columns: int) -> "StripeTable":
         """A table without any estimate."""

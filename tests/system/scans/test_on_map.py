@@ -106,6 +106,12 @@ def test_a_refused_change_ends_in_one_line_and_keeps_the_maps(
     assert not (tmp_path / "run-2").exists()
 
 
+@pytest.mark.parametrize("said", [True, "30 mW", 0])
+def test_what_is_no_dictionary_of_settings_ends_in_one_line(small: Path, said: Any) -> None:
+    with pytest.raises(UsageError, match=f"^on_map returned {said!r}; return None or a dictionary of settings$"):
+        api.scan(small, maps=3, on_map=lambda seen: said)
+
+
 def test_no_power_beyond_the_lasers_limit_is_ever_armed(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -89,3 +89,18 @@ def test_a_row_beyond_the_image_disturbs_nothing(row: int) -> None:
     follower.add(bits, np.array([1, 2], np.int32), np.zeros(2), np.zeros(2, np.int32))
     assert follower.finish() == "the sweep"
     assert not found[0].counts.any()
+
+
+def test_a_row_that_cannot_be_counted_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("rig.count.followed_row.add_row", fail)
+    inner, found = Recorder(), []
+    follower = RowFollower(inner, RowWish(lambda: 3, found.append), COLUMNS, WIDTH)
+    follower.reset()
+    frames = np.full((2, 5, WIDTH // 8), 255, np.uint8), np.array([1, 2], np.int32), np.zeros(2), np.zeros(2, np.int32)
+    follower.add(*frames)
+    assert follower.finish() == "the sweep"
+    assert inner.asked == ["reset", frames, "finish"]
+    assert not found

@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -48,6 +49,29 @@ def test_a_map_has_the_shapes_that_its_files_promise(estimator):
     np.testing.assert_array_equal(result.intensity, sweep.volume.intensity())
     assert result.compute_s > 0
     assert (result.fog.extinction_per_m is None) == (estimator in ("argmax", "edge"))
+
+
+def test_a_strangers_estimator_that_errs_is_named(monkeypatch):
+    sweep = simulated()
+    maker = reconstructor(sweep)
+    answer = maker.map(sweep.volume).stripe
+    monkeypatch.setattr(maker, "_name", "their-own")
+
+    def raising(*_):
+        raise IndexError("their mistake")
+
+    for wrong, told in (
+        (replace(answer, haze=answer.haze[:5]), "haze as float32 (5, 96), which must be float32 (32, 96)"),
+        (replace(answer, x_px=answer.x_px.astype(float)), "x_px as float64 (32, 96)"),
+        (replace(answer, signal=None), "signal as NoneType ()"),
+    ):
+        monkeypatch.setattr(maker.estimator, "estimate", lambda *_, wrong=wrong: wrong)
+        with pytest.raises(UsageError, match=re.escape(f"estimator their-own gives {told}")):
+            maker.map(sweep.volume)
+    monkeypatch.setattr(maker.estimator, "estimate", raising)
+    with pytest.raises(IndexError) as raised:
+        maker.map(sweep.volume)
+    assert raised.value.__notes__ == ["raised by the estimator their-own of another package: tell its authors"]
 
 
 def test_depth_of_a_foggy_street_is_close_to_the_truth():
