@@ -359,6 +359,7 @@ class _ShowsRun(_Shows):
             "title": self.title,
             "numbers": source.numbers,
             "estimators": list(estimator_names()) if source.recorded else [],
+            "estimator": source.summary.get("estimator"),
             "notes": source.notes,
             "folder": str(source.folder),
             "exposures": source.summary.get("exposures"),
