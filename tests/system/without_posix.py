@@ -132,7 +132,20 @@ def strip() -> None:
                 delattr(owner, name)
     tempfile.TemporaryFile = tempfile.NamedTemporaryFile  # type: ignore[misc, assignment]
     signal.SIGBREAK = signal.SIGINT  # type: ignore[attr-defined]
+    importlib.import_module("numba.core.registry").cpu_target.target_context.refresh()  # loads what it loads late
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in ("numba", "llvmlite") and getattr(module, "sys", None) is sys:
+            module.sys = TheCompilersSys()  # type: ignore[attr-defined]
     sys.platform = "win32"
+
+
+class TheCompilersSys:
+    """`sys` as the compiler sees it: it makes code for this system, and calls its functions by their names here."""
+
+    platform = sys.platform
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys, name)
 
 
 def run(*commands: Sequence[str]) -> None:

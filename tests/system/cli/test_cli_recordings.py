@@ -44,7 +44,7 @@ def test_parts_and_compressed_recordings_are_recordings(rig: Rig, run: Path, tmp
         told = json.loads(rig("info", folder, "--json").out)
         assert (told["maps"], told["verdict"], told["problems"]) == (maps, "complete", [])
         assert rig("verify", folder).code == 0
-    assert "start 0: frames " in rig("info", tmp_path / "part").out
+    assert re.search(r"^start 0: .*frames \d", rig("info", tmp_path / "part").out, re.MULTILINE)
     assert rig("cut", run, "--frames", "0:9", "--out", tmp_path / "few").out.rstrip().endswith("blocks, no whole map")
 
 
