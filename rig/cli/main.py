@@ -35,10 +35,10 @@ app = typer.Typer(
 )
 # In the order in which '--help' lists them; groups come last.
 for _commands in (
-    devices.SCENES,
-    recordings.COMMANDS,
     scan.COMMANDS,
     view.COMMANDS,
+    devices.SCENES,
+    recordings.COMMANDS,
     calibrate.COMMANDS,
     devices.COMMANDS,
     bench.COMMANDS,
