@@ -21,9 +21,13 @@ def hold(fd: int) -> None:
 
 def is_held(file: Path) -> bool:
     """Whether a file is locked (`hold`). False if there is no such file, and on Windows."""
-    if fcntl is None or not file.exists():
+    if fcntl is None:
         return False
-    with file.open("rb") as stream:
+    try:
+        stream = file.open("rb")
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    with stream:
         try:
             fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
