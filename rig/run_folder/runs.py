@@ -134,7 +134,7 @@ def _entry(folder: Path) -> RunEntry:
     try:
         manifest = read_manifest(folder) or {}
         problem = "" if manifest else f"{MANIFEST} is missing"
-        summary = _summary_of(folder)
+        summary = read_summary(folder)
     except DamagedRecordingError as error:
         problem = str(error).partition(";")[0]
     size, newest = _size_and_time(folder)
@@ -157,7 +157,7 @@ def _entry(folder: Path) -> RunEntry:
     )
 
 
-def _summary_of(folder: Path) -> Mapping[str, Any]:
+def read_summary(folder: Path) -> Mapping[str, Any]:
     """The summary of a run; empty if there is none, as while the run goes on. Raises DamagedRecordingError."""
     try:
         content = parse_json((folder / SUMMARY).read_bytes())

@@ -5,7 +5,6 @@ So a client that is slow, stops reading or floods costs one map of memory and a 
 other client notices.
 """
 
-import hmac
 import logging
 import socket
 import sys
@@ -70,7 +69,7 @@ class DepthServer:
     """
 
     def __init__(self, request: StreamRequest) -> None:
-        access = Access.to(request.host, request.port, request.token)
+        self._access = access = Access.to(request.host, request.port, request.token)
         self.token = access.token
         """The token that clients must send; None for nobody."""
         self.counts = StreamCounts()
@@ -213,7 +212,7 @@ class DepthServer:
                 self._clients.discard(client)
 
     def _knows(self, hello: Hello) -> bool:
-        return self.token is None or hmac.compare_digest(hello.token.encode(), self.token.encode())
+        return self._access.knows(hello.token)
 
     def _send_news(self, client: socket.socket, hello: Hello) -> None:
         """Send a client all that is new to it, until it goes away or the server ends."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from calibration.files.npy_files import load_arrays
 from drivers.errors import DeviceError
-from drivers.json_text import parse_json
 from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, RigError, UsageError
 from rig.exchange.npy import MapFiles, load
@@ -23,6 +22,7 @@ from rig.recording.map_rows import MapRows, RowCounts
 from rig.recording.open import open_recording, require_recording
 from rig.run_folder.manifest import read_manifest
 from rig.run_folder.pictures import ply_points
+from rig.run_folder.runs import read_summary
 from rig.scan.monitor import add_frames
 from rig.simd import Float32
 from rig.view.shown import ShownMap, at_pixels
@@ -185,10 +185,9 @@ def read_map(folder: Path, number: int, rays: tuple[Float32, Float32] | None, ab
 
 def _summary(folder: Path) -> Mapping[str, Any]:
     try:
-        content = parse_json((folder / "summary.json").read_bytes())
-    except (OSError, ValueError):
+        return read_summary(folder)
+    except DamagedRecordingError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _bytes(folder: Path, kind: str, number: int, suffix: str) -> bytes | None:
