@@ -6,7 +6,7 @@ whether they are the very bits that the documentation speaks of.
 
 import hashlib
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,13 +35,7 @@ class ExampleRecording:
 
     def as_json(self) -> dict[str, Any]:
         """The fields as plain values."""
-        return {
-            "folder": str(self.folder),
-            "frames": self.frames,
-            "bytes": self.bytes,
-            "sha256": self.sha256,
-            "as_published": self.as_published,
-        }
+        return asdict(self) | {"folder": str(self.folder)}
 
 
 def example_recording(out: PathLike) -> ExampleRecording:
