@@ -1,0 +1,100 @@
+"""What every strategy may use: light out, counts in.
+
+An `Apparatus` is one camera in front of one scene, with one light source of a given power. A strategy chooses what is
+lit and for how long, and gets what the camera reads. It never learns of the scene, the medium or the noise. The
+simulated one is `sim_backend.projector`; the apparatus keeps an account of time and energy, which `compare` holds
+against the budget.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rule = Literal["energy", "irradiance"]
+"""How light is shared. `energy`: every pattern has the whole power, spread over what it lights, so a line is brighter
+than a picture. `irradiance`: a lit column is equally bright however many are lit, namely as bright as the whole power
+spread over half of the columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What a measurement may take. time_s: from the first exposure to the end of the last, all patterns together."""
+
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What a measurement took. energy_j: light that left the source."""
+
+    time_s: float
+    energy_j: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PulseTimes:
+    """Arrival times of first photons. counts: (rows, width, bins) uint32; a photon in bin i came between
+    start_s + i bin_s and start_s + (i + 1) bin_s after its pulse left. pulses: number of pulses that each pixel got.
+    """
+
+    counts: NDArray[np.uint32]
+    start_s: float
+    bin_s: float
+    pulses: int
+
+
+class Apparatus(Protocol):
+    """One camera, one light source, one scene. Counts are drawn anew at every call; calls follow each other in time."""
+
+    rows: NDArray[np.int64]
+    """Image rows that are measured, ascending; all other shapes say `rows` for their number."""
+    width: int
+    """Pixels per row."""
+    columns: int
+    """Number of columns of the projector, or positions of the line."""
+    spad_frame_s: float
+    """Time of a one-bit frame of the SPAD array, exposure and read-out together."""
+    camera_frame_s: float
+    """Shortest time of a frame of the conventional camera."""
+    camera_full_scale: int
+    """Largest value of a pixel of the conventional camera."""
+
+    @property
+    def spent(self) -> Spent:
+        """Time and energy of all calls since the apparatus was made."""
+        ...
+
+    def spad_counts(self, patterns: NDArray[np.float32], frames: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """Show patterns one after the other, each for some frames of the SPAD, and count the frames in which each pixel
+        fired: (patterns, rows, width).
+
+        patterns: (patterns, columns), or (patterns, rows, columns) where rows differ; relative brightness, 0 to 1. A
+        pattern that is all zeros is dark. frames: (patterns,), at least 1.
+        """
+        ...
+
+    def camera_images(self, patterns: NDArray[np.float32], exposure_s: float) -> NDArray[np.uint16]:
+        """Show patterns one after the other, each for one exposure of the conventional camera: (patterns, rows, width),
+        0 to `camera_full_scale`. patterns as in `spad_counts`. exposure_s: at least `camera_frame_s`.
+        """
+        ...
+
+    def spots(self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int) -> NDArray[np.uint32]:
+        """Light single spots one after the other, each with the whole power for some frames of the SPAD. Returns
+        (spots, width), the counts of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,).
+        """
+        ...
+
+    def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
+        """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
+        pixel detects after each pulse. The pulses have the mean power of the source.
+        """
+        ...
+
+    def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
+        """Images of two conventional cameras in ambient light only, without the narrow filter: (2, rows, width). The
+        second one stands where the light source is, and looks the same way as the first. A single exposure.
+        """
+        ...
