@@ -1,8 +1,8 @@
 """A way to measure depth: what every one of them is, and how it is found by name.
 
 A strategy chooses what is lit and for how long, gets what the camera reads (`rig.strategies.apparatus`), and answers
-with a depth for each pixel. It is the object that an entry point of the group `spadrig.strategies` loads, so another
-package can add one. `ColumnGeometry` is all that a strategy knows of the rig: where a column of light lies in space.
+with a depth for each pixel. An entry point of the group `spadrig.strategies` loads such an object, most simply of a
+frozen dataclass, and has its name; so another package can add one. `ColumnGeometry` is all that a strategy knows of the rig: where a column of light lies in space.
 """
 
 from dataclasses import dataclass, replace
@@ -49,16 +49,30 @@ class Answer:
 class Strategy(Protocol):
     """A way to measure depth. The same object may measure with any apparatus, and keeps nothing between two of them."""
 
-    name: str
-    """As on the command line: lower case, with hyphens."""
-    sentence: str
-    """What it does, in one sentence."""
-    source: str
-    """Where it is published: author, title, place, year."""
-    light: Light
-    """What its source lights at a time."""
-    clear_px: float
-    """Largest median error, in pixels of disparity, that it promises in clear air with plenty of light."""
+    @property
+    def name(self) -> str:
+        """As on the command line: lower case, with hyphens."""
+        ...
+
+    @property
+    def sentence(self) -> str:
+        """What it does, in one sentence."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """Where it is published: author, title, place, year."""
+        ...
+
+    @property
+    def light(self) -> Light:
+        """What its source lights at a time."""
+        ...
+
+    @property
+    def clear_px(self) -> float:
+        """Largest median error, in pixels of disparity, that it promises in clear air with plenty of light."""
+        ...
 
     def measure(self, apparatus: Apparatus, geometry: "ColumnGeometry", budget: Budget, rng_seed: int) -> Answer:
         """Measure once. Raises `TooShort` if this takes longer than the budget allows, before any light is sent.
@@ -71,8 +85,8 @@ class Strategy(Protocol):
 class ColumnGeometry:
     """Where the light of each column lies, for the rows that are measured. Columns are fractional, centres at integers.
 
-    Between two columns the inverse depth at which a pixel sees them is interpolated linearly, which is exact to 1e-6 of
-    the depth for neighbouring columns. `depth_m` and `column_of` are inverse to each other.
+    Between two columns the inverse depth at which a pixel sees them is interpolated linearly, which is exact to 3e-5 of
+    the depth for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.
     """
 
     def __init__(
