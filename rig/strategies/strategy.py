@@ -2,7 +2,8 @@
 
 A strategy chooses what is lit and for how long, gets what the camera reads (`rig.strategies.apparatus`), and answers
 with a depth for each pixel. An entry point of the group `spadrig.strategies` loads such an object, most simply of a
-frozen dataclass, and has its name; so another package can add one. `ColumnGeometry` is all that a strategy knows of the rig: where a column of light lies in space.
+frozen dataclass, and has its name; so another package can add one. `ColumnGeometry` is all that a strategy knows of the
+rig: where a column of light lies in space.
 """
 
 from dataclasses import dataclass, replace
