@@ -26,8 +26,7 @@ from rig.count.map_checks import SURE, MapChecks, check_points
 from rig.estimate.registry import LEARNING
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.geometry import Geometry
-from tests.reference.made_scenes import pane_scene, thin_scene
-from tests.reference.random_scenes import random_scene
+from tests.reference.made_scenes import pane_scene, random_scene, thin_scene
 from tests.reference.scene import Scene, load_scene, scene_names
 from tests.reference.tables.printed import Table
 from tests.reference.working_point import POINTS, WorkingPoint

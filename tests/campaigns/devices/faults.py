@@ -12,18 +12,15 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 from tests.campaigns.devices import blanking, lasers, ni_cards, scanners, spad512s, spb_usb, syncs
-from tests.campaigns.devices.prawndo import PRAWNDO
-from tests.campaigns.devices.pulsestreamer import PULSESTREAMER
-from tests.campaigns.devices.teensy import TEENSY
 from tests.campaigns.outcomes import Ending, options, run
 
 SEQUENCES: Mapping[str, Callable[[int], Ending]] = {
     "obis": partial(lasers.sequence, lasers.OBIS),
     "cobolt": partial(lasers.sequence, lasers.COBOLT),
     "ibeam": partial(lasers.sequence, lasers.IBEAM),
-    "prawndo": partial(syncs.sequence, PRAWNDO),
-    "teensy": partial(syncs.sequence, TEENSY),
-    "pulsestreamer": partial(syncs.sequence, PULSESTREAMER),
+    "prawndo": partial(syncs.sequence, syncs.PRAWNDO),
+    "teensy": partial(syncs.sequence, syncs.TEENSY),
+    "pulsestreamer": partial(syncs.sequence, syncs.PULSESTREAMER),
     "helios": partial(scanners.sequence, scanners.HELIOS),
     "lasercube": partial(scanners.sequence, scanners.LASERCUBE),
     "etherdream": scanners.etherdream_sequence,

@@ -1,20 +1,30 @@
-"""Random faults on the wire of a sync source.
+"""Random faults on the wire of a sync source: a PrawnDO's and a Teensy's serial line, a Pulse Streamer's network.
 
 What a verb claims is held against the outputs themselves. After `abort` has returned all are low and stay low, whatever
 scan markers come; after `gate_low` the gate is. After `run` has returned the program comes out as it was written, and
 as often. A status of low outputs is one. A verb in a state that does not allow it is rightly refused.
+
+Serial lines are in virtual time, the network in the host's. On the network bits do not flip and answers do not merge:
+TCP carries checksums, and each call has a connection of its own. All else strikes: a question may be heard long after
+the driver has given it up, and some boxes keep their sequence in spite of `constant`.
 """
 
+import base64
 import random
+import struct
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
+from drivers.clock import SystemClock
 from drivers.errors import DeviceError
 from drivers.interfaces import OUT_FRAME, OUT_GATE, Pulse, SyncSource
+from drivers.sync.prawndo_line import PrawnDoTiming
 from tests.campaigns.outcomes import Ending, Verbs, close_or_raise
+from tests.wire.emulated_syncs import Board, PulseBox, TeensyBoard
 from tests.wire.faults import Fault, FaultSchedule
 
 VERBS = 6
@@ -213,3 +223,43 @@ class Sequence:
 
 def sequence(subject: Subject, seed: int) -> Ending:
     return Sequence(subject, seed).run()
+
+
+def _prawndo(faults: FaultSchedule, rng: random.Random) -> Board:
+    board = Board(faults, board=rng.choice((1, 2)))
+    if rng.random() < 0.3:  # left running by a dead host
+        words = bytes.fromhex("0200 00ca9a3b 0000 00000000 0000 00000000")
+        board.model.receive(b"adm 0 3\n", 0.0)
+        board.model.receive(words + b"swr\n", 0.0)
+    return board
+
+
+def _teensy(faults: FaultSchedule, rng: random.Random) -> TeensyBoard:
+    """Its watchdog is a long one, since the driver feeds it in the host's time."""
+    board = TeensyBoard(faults)
+    board.open = partial(board.open, watchdog="60 s")  # type: ignore[method-assign]
+    if rng.random() < 0.3:
+        board.model.receive(b"new 9 0\nadd 200989680 000989680\nend 2 0891486f\nrun 60000\n", 0.0)
+        assert board.plays
+    return board
+
+
+def _pulse_streamer(faults: FaultSchedule, rng: random.Random) -> PulseBox:
+    box = PulseBox(faults, clock=SystemClock(), keeps_sequence=rng.random() < 0.5)
+    if rng.random() < 0.3:
+        box.model.call("setTrigger", [rng.choice((0, 2)), 0], box.now_s)
+        steps = base64.b64encode(struct.pack(">IBhhIBhh", 5 * 10**6, 2, 0, 0, 10**6, 0, 0, 0)).decode()
+        box.model.call("stream", [steps, rng.choice((1, -1)), [0, 2, 0, 0]], box.now_s)
+    return box
+
+
+_PRAWNDO_TIMING = PrawnDoTiming(reply_s=0.06, hasty_s=0.03, lower_s=0.15, load_s=0.3)
+_TCP_FAULTS = tuple(kind for kind in Fault if kind not in (Fault.CORRUPTED, Fault.MERGED))
+# Virtual time for one verb: of a PrawnDO, freeing a board that swallows 180 kB included; of a Teensy, whose `run` and
+# `close` ask three times at most. In the host's time it is far beyond every wait once: a machine may be busy.
+PRAWNDO = Subject(_prawndo, _PRAWNDO_TIMING, deadline_s=5.0, late_s=0.08, stall_s=0.1)
+TEENSY = Subject(_teensy, 0.06, deadline_s=1.0, late_s=0.08, stall_s=0.1, interrupts=True)
+PULSESTREAMER = Subject(
+    _pulse_streamer, 0.15, deadline_s=20.0, late_s=0.25, stall_s=0.3, kinds=_TCP_FAULTS, waits=True,
+    interrupts=True,
+)  # fmt: skip

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tests.reference.adapter import reconstruct
 from tests.reference.geometry import Geometry
-from tests.reference.random_scenes import noise, random_scene
+from tests.reference.made_scenes import noise, random_scene
 from tests.reference.scene import Scene
 from tests.reference.tables.answers import calibration_error
 from tests.reference.working_point import POINTS, Light, WorkingPoint, at_stripe

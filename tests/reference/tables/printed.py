@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.reference.random_scenes import random_scene
+from tests.reference.made_scenes import random_scene
 from tests.reference.scene import Scene, load_scene, procedural_scene, scene_names
 
 
