@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from rig.api.scan import replay, scan
+from rig.api.scans import replay, scan
 from rig.config.overrides import SIMULATED, PathLike
 from rig.recording.segment import Space
 from rig.scan.run import RunResult

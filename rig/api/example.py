@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rig.api.scan import scan
+from rig.api.scans import scan
 from rig.config.overrides import PathLike
 from rig.recording.cut import cut
 from rig.recording.open import open_recording

@@ -275,7 +275,7 @@ def _code_of(error: Exception) -> int | None:
 
 def report(result: "RunResult") -> Answer:
     """The answer of a command that made a run: summary, and exit code of the verdict. Warns if no pixel has a depth."""
-    from rig.run_folder.summary import RunVerdict
+    from rig.run_folder.manifest import RunVerdict
 
     if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:
         say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")

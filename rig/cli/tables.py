@@ -11,23 +11,23 @@ from rich.console import Console
 from rich.table import Table
 
 from calibration.errors import digits
-from drivers.replay.pace import PaceReport
-from rig.bench.frames import COLUMNS
-from rig.bench.soak import SoakReport
-from rig.bench.speed import REAL_TIME_HZ, SpeedReport, SpeedRow
 from rig.cli.command import in_options
-from rig.depth.quality import RegionQuality
+from rig.run_folder.manifest import RunVerdict
 from rig.run_folder.runs import DAMAGED, RunEntry
-from rig.run_folder.summary import PipelineStats, RunVerdict, Summary, Synchronisation
-from rig.run_folder.time_of_day import RunTime
-from rig.scan.run import RunResult
-from rig.tradeoff.effects import Effect, Flux, SceneEffects
-from rig.tradeoff.rows import TradeoffRow
-from rig.tradeoff.trials import Tradeoff
 
 if TYPE_CHECKING:
+    from drivers.replay.pace import PaceReport
+    from rig.bench.soak import SoakReport
+    from rig.bench.speed import SpeedReport, SpeedRow
     from rig.calibrate.pixels import PixelResult
     from rig.calibrate.session import CalibrationResult
+    from rig.depth.quality import RegionQuality
+    from rig.run_folder.summary import PipelineStats, Summary, Synchronisation
+    from rig.run_folder.time_of_day import RunTime
+    from rig.scan.run import RunResult
+    from rig.tradeoff.effects import Effect, Flux, SceneEffects
+    from rig.tradeoff.rows import TradeoffRow
+    from rig.tradeoff.trials import Tradeoff
 
 WIDE = 300
 """Width in characters for a file or a pipe; no line here is as long."""
@@ -76,7 +76,7 @@ def _table(columns: "Columns[Row]", rows: Iterable[Row], *, left: Collection[str
     return table
 
 
-def run_table(result: RunResult) -> None:
+def run_table(result: "RunResult") -> None:
     """Print the table of a run to stdout."""
     summary = result.summary
     pairs = _rows(summary)
@@ -89,7 +89,7 @@ def run_table(result: RunResult) -> None:
     _print_pairs(pairs)
 
 
-def _advice(result: RunResult) -> str | None:
+def _advice(result: "RunResult") -> str | None:
     """The next step that the verdict calls for; for an aborted run, how much of it was made or kept."""
     summary = result.summary
     if summary.verdict is not RunVerdict.ABORTED or (summary.maps and result.folder is not None):
@@ -100,7 +100,7 @@ def _advice(result: RunResult) -> str | None:
     return f"the run ended before its first map was whole; {kept}"
 
 
-def effects_table(scene: SceneEffects) -> None:
+def effects_table(scene: "SceneEffects") -> None:
     """Print to stdout which effects are on, how much each matters and why."""
     # Narrow enough that a terminal of 80 columns has room for the reasons, which are wrapped.
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
@@ -128,14 +128,14 @@ def effects_table(scene: SceneEffects) -> None:
     )
 
 
-def flux_table(flux: Flux) -> None:
+def flux_table(flux: "Flux") -> None:
     """Print the flux of an image row to stdout: one text line per pixel, with one value per effect."""
     print("  ".join(f"{name:>12}" for name in flux))
     for x, *parts in zip(*flux.values(), strict=True):
         print("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
 
 
-def _error_change(effect: Effect) -> str:
+def _error_change(effect: "Effect") -> str:
     if effect.stripe_error_change_px is None:
         return "-"
     if effect.basis == "bound":
@@ -150,7 +150,7 @@ def _of_maps(maps: tuple[int, ...], of: int) -> str:
     return f"map {maps[0]}: " if len(maps) == 1 else f"{len(maps)} of {of} maps, the first is {maps[0]}: "
 
 
-def _rows(summary: Summary) -> list[tuple[str, str]]:
+def _rows(summary: "Summary") -> list[tuple[str, str]]:
     frames = summary.frames
     estimator = summary.estimator + (f" ({summary.estimator_why})" if summary.estimator_why else "")
     rows = [
@@ -191,7 +191,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     return rows
 
 
-def _taken(time: RunTime) -> str:
+def _taken(time: "RunTime") -> str:
     """First and last frame of the maps in UTC, and how sure that is."""
     first, last = time.first_frame_utc, time.last_frame_utc
     sure = "" if time.uncertainty_s is None else f" +- {digits(time.uncertainty_s * 1e3)} ms"
@@ -199,13 +199,13 @@ def _taken(time: RunTime) -> str:
     return f"{first} to {last[11:]}{sure}{scale}"
 
 
-def _sync(sync: Synchronisation) -> str:
+def _sync(sync: "Synchronisation") -> str:
     found = "" if sync.detection_probability is None else f", detected with p = {digits(sync.detection_probability, 6)}"
     clock_ppm = digits(1e6 * sync.clock_error, 2)
     return f"by {sync.by}{found}, residual {_number(sync.residual_columns, 2)} columns, clock {clock_ppm} ppm"
 
 
-def _clock(report: PaceReport) -> str:
+def _clock(report: "PaceReport") -> str:
     held = "" if report.held_s < LEAST_WAIT_S else f"; held up for {digits(report.held_s)} s by a full ring"
     return (
         f"blocks late by {digits(report.late_mean_s * 1e3, 2)} +- {digits(report.late_sd_s * 1e3, 2)} ms, at most "
@@ -213,7 +213,7 @@ def _clock(report: PaceReport) -> str:
     )
 
 
-def _stages(stages: PipelineStats) -> str:
+def _stages(stages: "PipelineStats") -> str:
     source = f"source {digits(stages.source_fill_s)} s" + (
         f" and {digits(stages.source_wait_s)} s of waiting" if stages.source_wait_s >= LEAST_WAIT_S else ""
     )
@@ -238,7 +238,7 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{value:.1%}"
 
 
-def _filled(summary: Summary) -> str:
+def _filled(summary: "Summary") -> str:
     left_out = f"; {summary.floating_points:.0f} that float are left out" if summary.floating_points else ""
     return f"{_percent(summary.valid_fraction)} of the pixels have a depth{left_out}"
 
@@ -281,7 +281,7 @@ def _one_line(text: str) -> str:
     return line if len(line) <= _NOTE_CHARACTERS else f"{line[: _NOTE_CHARACTERS - 3]}..."
 
 
-def quality_table(found: RegionQuality) -> None:
+def quality_table(found: "RegionQuality") -> None:
     """Print the quality of a region's depth to stdout."""
 
     def mm(value: float | None) -> str:
@@ -311,12 +311,12 @@ def quality_table(found: RegionQuality) -> None:
 WIDTH = 80
 """Most characters of a line of a trade-off, except lines that name files."""
 
-_SETTING: Columns[TradeoffRow] = (
+_SETTING: "Columns[TradeoffRow]" = (
     ("estimator", lambda row: row.estimator),
     ("filter", lambda row: row.filter),
     ("K", lambda row: str(row.exposures)),
 )
-_FIGURES: Columns[TradeoffRow] = (
+_FIGURES: "Columns[TradeoffRow]" = (
     *_SETTING,
     ("sensor\nms", lambda row: _short(row.sensor_ms)),
     ("compute\nms", lambda row: _short(row.compute_ms)),
@@ -327,7 +327,7 @@ _FIGURES: Columns[TradeoffRow] = (
     ("depth\nmm", lambda row: _short(row.depth_mm)),
     ("", lambda row: ("*" if row.pareto else " ") + ("+" if row.pareto_compute else "")),
 )
-_LIMITS: Columns[TradeoffRow] = (
+_LIMITS: "Columns[TradeoffRow]" = (
     *_SETTING,
     ("error\nx limit", lambda row: _times(row.times_limit)),
     ("> 1 px\nx limit", lambda row: _times(row.times_wrong_limit)),
@@ -339,7 +339,7 @@ _LIMITS: Columns[TradeoffRow] = (
 _LEFT = ("estimator", "filter", "")
 
 
-def tradeoff_table(done: Tradeoff) -> None:
+def tradeoff_table(done: "Tradeoff") -> None:
     """Print a trade-off to stdout, beginning with the setting to use.
 
     * marks rows on the Pareto front of error and sensor time, + those on the front of error and compute time.
@@ -367,7 +367,7 @@ def _named(scene: str, fog: str | None, lines: int) -> str:
     return scene + air + ("" if lines == 1 else f", {lines} lines at once")
 
 
-def _print(title: str, columns: "Columns[TradeoffRow]", rows: Sequence[TradeoffRow]) -> None:
+def _print(title: str, columns: "Columns[TradeoffRow]", rows: "Sequence[TradeoffRow]") -> None:
     console().print(title, style="bold", markup=False)
     console().print(_table(columns, rows, left=_LEFT))
     print()
@@ -400,7 +400,7 @@ _TITLES = {
 }
 
 
-_SPEED: Columns[SpeedRow] = (
+_SPEED: "Columns[SpeedRow]" = (
     ("window", lambda row: str(row.window)),
     ("K", lambda row: "-" if row.exposures is None else str(row.exposures)),
     ("threads", lambda row: str(row.threads)),
@@ -415,8 +415,11 @@ _SPEED: Columns[SpeedRow] = (
 )
 
 
-def speed_table(report: SpeedReport) -> None:
+def speed_table(report: "SpeedReport") -> None:
     """Print whether this machine keeps up, then the rows, grouped by stage, to stdout."""
+    from rig.bench.frames import COLUMNS
+    from rig.bench.speed import REAL_TIME_HZ
+
     out = console(BENCH_WIDTH)
     for point in report.working_points:
         out.print(str(point))
@@ -439,7 +442,7 @@ def speed_table(report: SpeedReport) -> None:
     out.print(f"measured in {report.seconds:.0f} s")
 
 
-def soak_table(report: SoakReport) -> None:
+def soak_table(report: "SoakReport") -> None:
     """Print the result of a soak to stdout."""
     frames, stages = report.frames, report.stages
     sums = f"{frames.received_in_sweeps} received, {frames.lost_in_sweeps} lost"

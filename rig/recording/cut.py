@@ -22,8 +22,7 @@ from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_span
 from rig.recording.writer import Recording
 from rig.requests import CutRequest
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.manifest import MANIFEST, UNFINISHED, known_missing, manifest_crc32, require_playable
-from rig.run_folder.summary import RunVerdict
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, RunVerdict, known_missing, manifest_crc32, require_playable
 
 OF_MAPS: Final = ("learned", "truth")
 """Folders with files of single maps, which are copied to the part."""

@@ -23,8 +23,7 @@ from rig.errors import RecordingError, UsageError
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
 from rig.run_folder.disk import is_held, replace_file, sync_folder
-from rig.run_folder.manifest import MANIFEST, UNFINISHED, device_counters, ended_early, sealed_text
-from rig.run_folder.summary import RunVerdict
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, RunVerdict, device_counters, ended_early, sealed_text
 
 _PIECE_BYTES: Final = 1 << 24
 Range = tuple[int, int]

@@ -24,9 +24,8 @@ from rig.report.profiles import row_profiles
 from rig.report.run_errors import depth_errors_m, errors_section
 from rig.report.run_facts import RunFacts
 from rig.report.run_settings import calibration_section, commands_section, settings_section, versions_section
-from rig.run_folder.manifest import UNFINISHED
+from rig.run_folder.manifest import UNFINISHED, RunVerdict
 from rig.run_folder.pictures import SCALE_PX, Scale, confidence_picture, depth_limits, depth_picture
-from rig.run_folder.summary import RunVerdict
 from rig.simd import Float32
 
 _GOOD: Final = RunVerdict.COMPLETE.value

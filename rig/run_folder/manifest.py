@@ -7,6 +7,7 @@ a digit that changed on the disk is detected, but different line breaks are acce
 import json
 import zlib
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -28,6 +29,22 @@ Section = dict[str, Any] | None
 Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
 RunGap = tuple[int, int, int]
 """Number of the start of the SPAD, and first and last missing frame."""
+
+
+class RunVerdict(StrEnum):
+    """Verdict on a run. Any but `complete` means that the result cannot be trusted as it is."""
+
+    COMPLETE = "complete"
+    GAPS = "gaps"
+    UNSYNCHRONISED = "unsynchronised"
+    DOUBTFUL = "doubtful"
+    UNCALIBRATED = "uncalibrated"
+    ABORTED = "aborted"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command line for this verdict."""
+        return {RunVerdict.COMPLETE: 0, RunVerdict.ABORTED: 4}.get(self, 1)
 
 
 class _Part(BaseModel):

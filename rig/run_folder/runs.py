@@ -16,8 +16,7 @@ from drivers.recorded.contents import INDEX_FILE
 from drivers.units import parse_quantity
 from rig.errors import DamagedRecordingError, UsageError
 from rig.requests import RunsRequest
-from rig.run_folder.manifest import MANIFEST, UNFINISHED, read_manifest
-from rig.run_folder.summary import RunVerdict
+from rig.run_folder.manifest import MANIFEST, UNFINISHED, RunVerdict, read_manifest
 
 SUMMARY: Final = "summary.json"
 DAMAGED: Final = "damaged"

@@ -3,7 +3,6 @@
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from enum import StrEnum
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from drivers.replay.pace import PaceReport
 from rig.depth.fog_meter import FogEstimate
 from rig.depth.reconstruct import MapResult
 from rig.geometry.stripe_table import depth_errors, stripe_errors
+from rig.run_folder.manifest import RunVerdict
 from rig.run_folder.time_of_day import RunTime
 
 _LARGEST = {
@@ -61,22 +61,6 @@ class PipelineStats:
             values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
             joined[name] = (max if name in _LARGEST else sum)(values) if values else None
         return PipelineStats(**joined)
-
-
-class RunVerdict(StrEnum):
-    """Verdict on a run. Any but `complete` means that the result cannot be trusted as it is."""
-
-    COMPLETE = "complete"
-    GAPS = "gaps"
-    UNSYNCHRONISED = "unsynchronised"
-    DOUBTFUL = "doubtful"
-    UNCALIBRATED = "uncalibrated"
-    ABORTED = "aborted"
-
-    @property
-    def exit_code(self) -> int:
-        """Exit code of the command line for this verdict."""
-        return {RunVerdict.COMPLETE: 0, RunVerdict.ABORTED: 4}.get(self, 1)
 
 
 @dataclass(frozen=True, slots=True)

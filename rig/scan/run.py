@@ -26,8 +26,8 @@ from rig.progress import tell_stage
 from rig.recording.segment import Space
 from rig.recording.writer import Recording
 from rig.run_folder.folder import Rays, RunFolder, SavePolicy
-from rig.run_folder.manifest import UNFINISHED, file_crc32
-from rig.run_folder.summary import MapTally, RunFrames, RunVerdict, Summary, Synchronisation
+from rig.run_folder.manifest import UNFINISHED, RunVerdict, file_crc32
+from rig.run_folder.summary import MapTally, RunFrames, Summary, Synchronisation
 from rig.scan.control_check import ControlCheck
 from rig.scan.on_request import PartsRecording, RecordingSwitch
 

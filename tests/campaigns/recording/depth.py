@@ -16,7 +16,7 @@ from calibration.files.rig_file import CALIBRATION_FILE
 from rig import api
 from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE
-from rig.run_folder.summary import RunVerdict
+from rig.run_folder.manifest import RunVerdict
 from tests.campaigns.outcomes import Ending, options, run
 from tests.campaigns.recording.corruptions import ending_with, scratch_folder, wound
 from tests.system.small_rig import config, write_rig

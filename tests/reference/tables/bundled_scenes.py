@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rig.api.scan import scan
+from rig.api.scans import scan
 from tests.reference.tables.printed import Table, parser_of
 
 SCENES = "street-clear,street,street-light-fog,street-dense-fog,street-smoke,street-rain,street-snow,street-everything"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.api.scan import scan
+from rig.api.scans import scan
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene, load_scene, procedural_scene

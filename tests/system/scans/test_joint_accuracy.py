@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from rig.api.scan import scan
+from rig.api.scans import scan
 from rig.config.files import load_config
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.made_scenes import smooth_scene, thin_scene

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 
 from drivers.interfaces import LineLaser
 from rig import api
-from rig.api import SeenMap
+from rig.api import SeenMap, scans
 from rig.config.models import RigConfig
 from rig.errors import PlanError, UsageError
 from tests.system import small_rig
@@ -167,8 +166,7 @@ def test_the_python_of_the_page_runs(small: Path, tmp_path: Path, monkeypatch: p
 def test_real_drivers_are_steered_without_being_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     armed: list[float] = []
-    scan_calls = sys.modules["rig.api.scan"]
-    open_rig, arm = scan_calls.open_rig, LineLaser.arm
+    open_rig, arm = scans.open_rig, LineLaser.arm
 
     def opening(config: RigConfig, **named: Any) -> Any:
         opened.append(config.name)
@@ -178,7 +176,7 @@ def test_real_drivers_are_steered_without_being_opened_again(tmp_path: Path, mon
         armed.append(power_w)
         arm(self, power_w)
 
-    monkeypatch.setattr(scan_calls, "open_rig", opening)
+    monkeypatch.setattr(scans, "open_rig", opening)
     monkeypatch.setattr(LineLaser, "arm", arming)
     config = small_rig.write_rig(tmp_path / "emulated", small_rig.emulated())
     powers = iter(["20 mW", "60 mW"])

@@ -15,7 +15,8 @@ from rig.devices.open import light_problems
 from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.run_folder.folder import SavePolicy, json_text
-from rig.run_folder.summary import MapTally, RunFrames, RunVerdict
+from rig.run_folder.manifest import RunVerdict
+from rig.run_folder.summary import MapTally, RunFrames
 
 
 def a_map(x: float, fog: FogEstimate | None = None) -> MapResult:

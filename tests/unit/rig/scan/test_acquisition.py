@@ -16,7 +16,7 @@ from drivers.interfaces import BurstMode, ScannerStatus
 from rig.count.sweeps import SweepAssembler
 from rig.count.volume import SweepCounter, SweepLayout
 from rig.errors import DevicesError
-from rig.run_folder.summary import RunVerdict
+from rig.run_folder.manifest import RunVerdict
 from rig.scan import pipeline
 from rig.scan.run import verdict_of
 from rig.threads import RowWorkers

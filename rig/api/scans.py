@@ -31,8 +31,9 @@ from rig.recording.replay import replay_config
 from rig.recording.segment import Space
 from rig.requests import ReconstructRequest, ReplayRequest, RunRequest, ScanRequest
 from rig.run_folder.folder import SavePolicy
+from rig.run_folder.manifest import RunVerdict
 from rig.run_folder.runs import label_problems
-from rig.run_folder.summary import MapTally, RunVerdict
+from rig.run_folder.summary import MapTally
 from rig.scan.monitor import Listeners, MonitorCallback, ScanProgress
 from rig.scan.on_request import RecordingSwitch
 from rig.scan.pipeline import Overload, require_policy

@@ -1,7 +1,7 @@
-"""The calls about runs that are there already: `runs` lists them, `repeat` gives what is needed to make one again."""
+"""The call that gives what is needed to make a scan again: `repeat`."""
 
 import logging
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,8 @@ from rig.config.files import parse_config
 from rig.config.models import RigConfig
 from rig.config.overrides import PathLike
 from rig.errors import UsageError
-from rig.requests import RunsRequest, ScanRequest
+from rig.requests import ScanRequest
 from rig.run_folder.manifest import MANIFEST, read_manifest
-from rig.run_folder.runs import RunEntry, list_runs
 
 _log = logging.getLogger(__name__)
 
@@ -21,16 +20,6 @@ _IN_CONFIG = ("scene", "exposures", "estimator", "filter", "min_confidence", "te
 """Options of a scan that the config in its manifest contains already."""
 _OF_THE_RUN = ("out", "note", "tags", "arm")
 """Options that belong to one run alone. Consent to light is given anew for each."""
-
-
-def runs(folder: PathLike = "runs", request: RunsRequest | None = None, **changes: Any) -> list[RunEntry]:
-    """List the runs in a folder and up to three levels below it, the oldest first (`rig runs`).
-
-    request, changes: filters, as a `RunsRequest` or by the names of its fields: `runs("runs", tags=["fog"])`. A run
-    with damaged files is listed with the verdict 'damaged' and its `problem`. Raises UsageError for a folder that is
-    not there and for filters that cannot be read.
-    """
-    return list_runs(Path(folder), replace(request or RunsRequest(), **changes))
 
 
 def repeat(run: PathLike) -> tuple[RigConfig, ScanRequest]:

@@ -1,4 +1,7 @@
-"""The call that makes one page of a run, of two runs side by side, of a calibration, or of a trade-off: `report`."""
+"""The call that makes one page of a run, of two runs side by side, of a calibration, or of a trade-off: `report`.
+
+Most reports are of runs, and their reader waits: what only the others need is imported when they are asked for.
+"""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -8,7 +11,6 @@ from typing import Final
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from rig.config.overrides import PathLike
-from rig.devices.calibration_use import notes_on
 from rig.errors import UsageError
 from rig.report.calibration import calibration_report
 from rig.report.page import is_report
@@ -16,7 +18,6 @@ from rig.report.run import run_report
 from rig.report.run_facts import read_run
 from rig.run_folder.disk import replace_file
 from rig.run_folder.runs import is_run
-from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
 
 _WHAT: Final = "name the folder of a run, a calibration or a trade-off, or a calibration.yaml"
 
@@ -60,6 +61,8 @@ def report(
     elif kind == "calibration":
         text = _calibration(folder)
     else:
+        from rig.tradeoff.files import tradeoff_report
+
         text = tradeoff_report(folder)
     file = Path(out) if out is not None else _beside(folder, second)
     _write(file, text)
@@ -70,12 +73,14 @@ def _kind(path: Path) -> str:
     if not path.exists():
         raise UsageError(f"{path} does not exist; {_WHAT}")
     if path.is_dir():
-        if (path / TRADEOFF_FILE).exists():
-            return "tradeoff"
         if is_run(path):
             return "run"
         if (path / CALIBRATION_FILE).exists():
             return "calibration"
+        from rig.tradeoff.files import TRADEOFF_FILE
+
+        if (path / TRADEOFF_FILE).exists():
+            return "tradeoff"
         raise UsageError(f"{path} holds no run, no calibration and no trade-off; {_WHAT}")
     if path.suffix in (".yaml", ".yml"):
         return "calibration"
@@ -83,6 +88,8 @@ def _kind(path: Path) -> str:
 
 
 def _calibration(path: Path) -> str:
+    from rig.devices.calibration_use import notes_on
+
     file = path / CALIBRATION_FILE if path.is_dir() else path
     try:
         model = load_rig_model(file)
