@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from calibration.errors import CalibrationError
@@ -25,8 +25,13 @@ from sim_backend.frames.photons import PhotonSource
 from sim_backend.light.line import ONE_LINE, LineFan, line_width
 from sim_backend.light.optics import Line, Optics, Sensor, detections_per_radiance
 from sim_backend.light.view import CameraView, make_view
+from sim_backend.projector.hardware import ConventionalCamera, PulsedSource
 from sim_backend.scenes.medium import Section
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
+
+if TYPE_CHECKING:
+    from sim_backend.projector.apparatus import Rule, SimulatedApparatus
+    from sim_backend.projector.transport import Transport
 
 LEAST_PIXELS = 2
 """Least width and height of the camera, in pixels: light is computed from the rays' change from pixel to pixel."""
@@ -86,6 +91,8 @@ class WorldConfig(KindConfig):
     effects: Annotated[Wanted, AfterValidator(_known)] = "planned"
     """Effects that are simulated, of those that the scene calls for. `planned`: all but those that provably change next
     to nothing; `all`; or a list of names (for ablations)."""
+    conventional_camera: ConventionalCamera = Field(default_factory=ConventionalCamera)
+    pulsed_source: PulsedSource = Field(default_factory=PulsedSource)
     command_grid: CommandGridConfig | None = None
     """Columns whose frames get the light of one mirror position; `hold_columns` replaces them. None: finer cells."""
 
@@ -95,6 +102,8 @@ class WorldConfig(KindConfig):
         return bool(load_scene(self.scene)[0].boards)
 
 
+LONGEST = PlannedFor(power_w=1.0, exposure_s=1.0, exposures=100_000)
+"""Power, time and frames of a pattern for which the effects are chosen that an apparatus has."""
 MOST_VIEWS, TIME_STEP_S = 64, 1e-3
 """A moving scene's truth is put together from about `MOST_VIEWS` moments at most, at least `TIME_STEP_S` apart."""
 
@@ -135,6 +144,7 @@ class SimulatedWorld:
         self.setting = Setting(view, self.scene, config.optics, config.sensor, config.line, gain, _own(self.model))
         self._planned_for = MOST
         self._planned: tuple[EffectPlan, FluxModel] | None = None
+        self._shown: tuple[object, Transport, FluxModel] | None = None
         self.bench = Bench(surroundings.clock, self.model.lag_s)
         self.fan: LineFan = ONE_LINE
         """The lines that leave the mirror together."""
@@ -266,6 +276,35 @@ class SimulatedWorld:
         from sim_backend.effects_report import flux_row
 
         return flux_row(self, row, command, power_w, exposure_s)
+
+    def apparatus(
+        self, *, rows: ArrayLike, columns: int, command_range: tuple[float, float], power_w: float, rule: "Rule",
+        seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
+    ) -> "SimulatedApparatus":  # fmt: skip
+        """The scene before other light sources and cameras, at time 0: see `rig.strategies.apparatus.MakesApparatus`.
+
+        The light transport of the latest rows, columns and command range is kept. Effects are those that the scene
+        calls for, except such as are negligible up to `LONGEST`.
+        """
+        from sim_backend.projector.apparatus import Hardware, Request, SimulatedApparatus
+
+        request = Request(power_w, rule, seed, depth_range_m, spad_frame_s)
+        hardware = Hardware(self.config.conventional_camera, self.config.pulsed_source)
+        return SimulatedApparatus(*self._transport(rows, columns, command_range), hardware, request)
+
+    def _transport(
+        self, rows: ArrayLike, columns: int, command_range: tuple[float, float]
+    ) -> "tuple[Transport, FluxModel]":
+        from sim_backend.projector.transport import Transport, checked_columns, checked_rows
+
+        at = checked_rows(rows, self.size[0])
+        commands = checked_columns(columns, command_range, self.model.scanner.command_range)
+        key = at.tobytes(), commands.tobytes()
+        if self._shown is None or self._shown[0] != key:
+            self._shown = None  # the memory of the old one is needed for the new
+            _, flux = plan_effects(self.setting, self.sampled_planes, LONGEST, self.config.effects)
+            self._shown = key, Transport(self.model, flux, at, commands), flux
+        return self._shown[1:]
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
         """A source of frames with this timing. threads: most threads that it uses."""

@@ -4,6 +4,8 @@ Input: a power (`LineLaser`), a waveform (`BeamScanner`), pulses of the gate (`S
 (`SpadArray`). Output: blocks of frames in a ring, and the limits and the status that each device reports.
 """
 
+from drivers.interfaces.apparatus import PulseTimes as PulseTimes
+from drivers.interfaces.apparatus import Spent as Spent
 from drivers.interfaces.device import Device as Device
 from drivers.interfaces.device import DeviceState as DeviceState
 from drivers.interfaces.laser import LaserLimits as LaserLimits

@@ -7,10 +7,14 @@ against the budget.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from drivers.interfaces import PulseTimes as PulseTimes
+from drivers.interfaces import Spent as Spent
+from drivers.interfaces import World
 
 Rule = Literal["energy", "irradiance"]
 """How light is shared. `energy`: every pattern has the whole power, spread over what it lights, so a line is brighter
@@ -23,26 +27,6 @@ class Budget:
     """What a measurement may take. time_s: from the first exposure to the end of the last, all patterns together."""
 
     time_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Spent:
-    """What a measurement took. energy_j: light that left the source."""
-
-    time_s: float
-    energy_j: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PulseTimes:
-    """Arrival times of first photons. counts: (rows, width, bins) uint32; a photon in bin i came between
-    start_s + i bin_s and start_s + (i + 1) bin_s after its pulse left. pulses: number of pulses that each pixel got.
-    """
-
-    counts: NDArray[np.uint32]
-    start_s: float
-    bin_s: float
-    pulses: int
 
 
 class Apparatus(Protocol):
@@ -60,6 +44,8 @@ class Apparatus(Protocol):
     """Shortest time of a frame of the conventional camera."""
     camera_full_scale: int
     """Largest value of a pixel of the conventional camera."""
+    pulse_sigma_s: float
+    """Standard deviation of the times of photons that a flat surface returns: pulse and timing error together."""
 
     @property
     def spent(self) -> Spent:
@@ -89,12 +75,32 @@ class Apparatus(Protocol):
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
-        pixel detects after each pulse. The pulses have the mean power of the source.
+        pixel detects after each pulse. The pulses have the mean power of the source. Light from a range r comes 2 r / c
+        after the middle of its pulse has left, with the source at the camera. A gate keeps the pixels off before the
+        nearest depth can answer and after the farthest.
         """
         ...
 
     def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
         """Images of two conventional cameras in ambient light only, without the narrow filter: (2, rows, width). The
         second one stands where the light source is, and looks the same way as the first. A single exposure.
+        """
+        ...
+
+
+@runtime_checkable
+class MakesApparatus(World, Protocol):
+    """A world that can be measured in other ways than with a scanned line."""
+
+    def apparatus(
+        self, *, rows: NDArray[np.int64], columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
+        seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
+    ) -> Apparatus:  # fmt: skip
+        """An apparatus at time 0. Light transport is kept, so another one for the same rows and columns is quick.
+
+        rows: image rows to measure, ascending. columns, command_range: as in a scan, column c is the line at the
+        mirror's command first + (c + 0.5) (last - first) / columns. power_w: mean power of the source. seed: of all
+        random draws. depth_range_m: gate of the pulsed source. Raises ValueError for values that cannot be, and
+        DeviceError for a scene that moves.
         """
         ...

@@ -206,6 +206,12 @@ class ParticleLight:
         span = np.array([np.nanmax(view.u), np.nanmax(view.v)]) + MARGIN - low
         self.particles = make_particles(what, np.column_stack([low, span]), farthest_m, rng)
 
+    @property
+    def reach_m(self) -> float:
+        """Distance from the middle of a sheet beyond which no particle is lit."""
+        at_mirror_m, per_m = self._sheet_sd
+        return REACH_SIGMAS * (at_mirror_m + per_m * FARTHEST_RANGE_M)
+
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """See `LaserEffect`."""
         if not np.isfinite(sheet.inverse).all():

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import FrameTimes, Setting, Words
+from sim_backend.light.optics import Sensor
 from sim_backend.random_numbers import WORD_PX, frame_key
 
 _CROSSTALK, _ERRORS = np.uint64(0xC6A4A7935BD1E995), np.uint64(0x8EBC6AF09C88C6E3)
@@ -100,6 +101,13 @@ def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log
             place = next_hit(place, key, draw, log_miss)
 
 
+def defects(sensor: Sensor, size: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The dead and the hot pixels, two masks of shape `size` (rows, width). The same sensor always gets the same."""
+    # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
+    lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(size)
+    return lot < sensor.dead_share, lot >= 1 - sensor.hot_share
+
+
 class Defects:
     """Hot and dead pixels, whose electronics read 1 or 0 in every frame, whatever their diode does.
 
@@ -113,11 +121,8 @@ class Defects:
     reads_before = False
 
     def __init__(self, setting: Setting) -> None:
-        sensor = setting.sensor
-        # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
-        lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(setting.view.u.shape)
-        self._alive = packed(lot >= sensor.dead_share)
-        self._hot = packed(lot >= 1 - sensor.hot_share)
+        dead, hot = defects(setting.sensor, setting.view.u.shape)
+        self._alive, self._hot = packed(~dead), packed(hot)
 
     def apply(self, seed: np.uint64, first_frame: int, words: Words, before: Words, times: FrameTimes) -> None:
         """See `BitEffect`."""

@@ -1,0 +1,26 @@
+"""Results that an apparatus gives to a way of measuring depth (`rig.strategies.apparatus`), whoever makes them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What a measurement took. energy_j: light that left the source."""
+
+    time_s: float
+    energy_j: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PulseTimes:
+    """Arrival times of first photons. counts: (rows, width, bins) uint32; a photon in bin i came between
+    start_s + i bin_s and start_s + (i + 1) bin_s after its pulse left. pulses: number of pulses that each pixel got.
+    """
+
+    counts: NDArray[np.uint32]
+    start_s: float
+    bin_s: float
+    pulses: int

@@ -1,0 +1,134 @@
+"""Random counts of a one-bit SPAD and of a conventional camera.
+
+A pixel that detects on average lambda photons in a frame reads 1 with probability 1 - exp(-lambda), so of n frames it
+fires in
+
+    N ~ Binomial(n, 1 - exp(-lambda)),    P(N = 0) = exp(-n lambda)
+
+drawn exactly: by inversion where few frames fire or few do not (one uniform number, and the chances of 0, 1, 2, ... one
+after the other), otherwise by rejection (`numpy.random.Generator.binomial`, BTPE). A detection rate of 0 never fires,
+an infinite one always. Draws go row by row, pattern by pattern and pixel by pixel, so they do not depend on how
+rows are grouped in calls. Measured on one core: 9 ns a count in the dark, 30 ns at one detection, 90 ns by rejection.
+"""
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backend.effects.afterpulsing import after_probability, blind_probability
+from sim_backend.effects.sensor_bits import defects
+from sim_backend.effects.setting import FrameTimes
+from sim_backend.frames.flux import FluxModel
+from sim_backend.projector.hardware import ConventionalCamera
+
+Array = NDArray[np.float64]
+
+BLACK_SIGMAS = 4.0
+"""Black level of the conventional camera, in standard deviations of its read noise, which is then not cut off at 0."""
+INVERSION = 30.0
+"""Mean number of counts, or of frames without one, up to which they are drawn by inversion."""
+LEAST_CHANCE = 1e-25
+"""Inversion ends at chances below it: only rounding can lead there. The first one is at least exp(-60 ln 2) = 1e-18."""
+
+
+@numba.njit(cache=True, nogil=True)
+def count(rng: np.random.Generator, frames: int, flux: float) -> int:
+    """Number of frames out of `frames` in which a pixel fires that detects `flux` photons in a frame."""
+    if not flux > 0.0 or frames <= 0:
+        return 0
+    dark = math.exp(-flux)
+    if dark == 0.0:
+        return frames
+    if dark >= 0.5:
+        if frames * (1.0 - dark) <= INVERSION:
+            return _inverted(rng, frames, flux)
+    elif frames * dark <= INVERSION:
+        # The frames without a count are counted, with the flux that makes them so frequent.
+        return frames - _inverted(rng, frames, -math.log1p(-dark))
+    return int(rng.binomial(frames, 1.0 - dark))
+
+
+@numba.njit(cache=True, nogil=True)
+def _inverted(rng: np.random.Generator, frames: int, flux: float) -> int:
+    """`count` by inversion, for a flux below ln 2."""
+    chance, odds = math.exp(-frames * flux), math.expm1(flux)
+    left = rng.random() - chance
+    found = 0
+    while left > 0.0 and found < frames and chance > LEAST_CHANCE:
+        found += 1
+        chance *= odds * (frames - found + 1) / found
+        left -= chance
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def add_counts(
+    rng: np.random.Generator, frames: NDArray[np.int64], flux: Array, patterns: NDArray[np.int64],
+    counts: NDArray[np.uint32],
+) -> None:  # fmt: skip
+    """Add to counts[patterns] (patterns, rows, width) how many frames fire, out of frames (n,) with flux (rows, n,
+    width) photons a frame. patterns: (n,)."""
+    for y in range(flux.shape[0]):
+        for i in range(flux.shape[1]):
+            for x in range(flux.shape[2]):
+                counts[patterns[i], y, x] += np.uint32(count(rng, frames[i], flux[y, i, x]))
+
+
+def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCamera) -> NDArray[np.uint16]:
+    """What a conventional camera reads of pixels that collect so many electrons on average.
+
+    Electrons are Poisson distributed; a full pixel collects no more. The read-out adds Gaussian noise. The converter
+    rounds to whole steps, of which its range has 2^bits - 1 for the full well above a black level of `BLACK_SIGMAS` of
+    the noise.
+    """
+    # A pixel that is full beyond doubt needs no exact number.
+    collected = rng.poisson(np.clip(np.nan_to_num(electrons), 0.0, 4.0 * camera.full_well + 1e3)).astype(np.float64)
+    np.minimum(collected, camera.full_well, out=collected)
+    collected += camera.read_noise * (rng.standard_normal(collected.shape) + BLACK_SIGMAS)
+    full_scale = 2**camera.bits - 1
+    steps = collected * (full_scale / (camera.full_well + BLACK_SIGMAS * camera.read_noise))
+    return np.asarray(np.clip(np.rint(steps), 0, full_scale), np.uint16)
+
+
+class SensorBits:
+    """What the sensor does to the bits, pixel by pixel.
+
+    Dead and hot pixels and bit errors are exact. Of crosstalk and afterpulses the mean is right: each pixel has the
+    probability that it would have among such neighbours and after such a frame, but is drawn independently of them; the
+    rows above and below, which may not be measured, are taken to be as bright as the pixel itself.
+    """
+
+    def __init__(self, flux: FluxModel, rows: NDArray[np.int64], frame_s: float) -> None:
+        """frame_s: exposure and period of a frame."""
+        sensor, names = flux.setting.sensor, flux.bits
+        times = FrameTimes(frame_s, frame_s)
+        self._after = self._blind = 0.0
+        if "afterpulsing and dead time" in names:
+            self._after = after_probability(sensor.afterpulsing, sensor.trap_lifetime, times)
+            self._blind = blind_probability(sensor.dead_time, times)
+        self._crosstalk = sensor.crosstalk / 4 if "crosstalk" in names else 0.0
+        self._errors = sensor.bit_error_rate if "bit errors" in names else 0.0
+        self._dead, self._hot = None, None
+        if "hot and dead pixels" in names:
+            dead, hot = defects(sensor, flux.setting.view.u.shape)
+            self._dead, self._hot = dead[rows], hot[rows]
+        self.none = not names
+        """Whether the bits stay as they are."""
+
+    def seen(self, flux: Array, rows: slice | NDArray[np.int64]) -> Array:
+        """The flux (rows, patterns, width) of a perfect sensor whose bits would be as often 1."""
+        if self.none:
+            return flux
+        p = -np.expm1(-flux)
+        p = 1.0 - (1.0 - p * (1.0 - self._blind * p)) * (1.0 - self._after * p)
+        if self._crosstalk:
+            beside = np.pad(p, ((0, 0), (0, 0), (1, 1)))
+            quiet = (1 - self._crosstalk * beside[..., 2:]) * (1 - self._crosstalk * beside[..., :-2])
+            p = 1.0 - (1.0 - p) * quiet * (1 - self._crosstalk * p) ** 2
+        if self._dead is not None and self._hot is not None:
+            p = np.where(self._hot[rows, None], 1.0, np.where(self._dead[rows, None], 0.0, p))
+        p = p + self._errors * (1.0 - 2.0 * p)
+        with np.errstate(divide="ignore"):
+            return np.asarray(-np.log1p(-np.clip(p, 0.0, 1.0)))
