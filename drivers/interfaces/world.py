@@ -13,10 +13,12 @@ class SweepTruth:
 
     x_px: float32 (rows, columns), true stripe position in each image row, in pixels of the raw image; NaN = no stripe.
     depth_m: float32 (rows, width), true z per camera pixel; NaN = nothing there.
+    trusted: bool (rows, width), False where the scene's depth was guessed and nothing should be scored; None: nowhere.
     """
 
     x_px: NDArray[np.float32]
     depth_m: NDArray[np.float32]
+    trusted: NDArray[np.bool_] | None = None
 
 
 class World(Protocol):
