@@ -1,0 +1,81 @@
+"""Scores an answer against the truth, by the same rules for every way to measure depth.
+
+Scored are the pixels that camera and source both see, within the depth range, where the scene's depth was measured and
+not guessed. The error in pixels is that of the disparity, b f |1/z - 1/z_true|: the same unit for all, whether they
+triangulate or time. A missing answer, and a larger error, count as `MISSING_PX`, so that leaving answers out does not
+help.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.interfaces import SweepTruth
+from rig.geometry.stripe_table import MISSING_PX
+from rig.simd import Bools
+from rig.strategies.strategy import Answer, ColumnGeometry
+
+GOOD: Final = 0.02
+"""Share of the depth by which a good answer may be off."""
+CONFIDENT: Final = 0.9
+"""Confidence from which an answer claims to be right."""
+SAME_PX: Final = 1.5
+"""Largest distance of a pixel from the true stripe of the nearest columns if the source sees the pixel's surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """pixels: number of scored ones. mean_px: mean error of all of them, missing ones and larger errors as MISSING_PX.
+
+    median_px, median_m: median error of those with an answer, in pixels of disparity and in metres; None without any.
+    good, valid, confident_wrong: shares of all scored pixels: with an answer within 2 % of the depth, with any answer,
+    and with an answer of confidence 0.9 or more that is not within 2 %.
+    """
+
+    pixels: int
+    mean_px: float
+    median_px: float | None
+    median_m: float | None
+    good: float
+    valid: float
+    confident_wrong: float
+
+
+def scored_pixels(truth: SweepTruth, geometry: ColumnGeometry) -> Bools:
+    """Pixels (rows, width) of the measured rows that are scored. truth: of all rows, for the geometry's columns."""
+    depth_m, stripes = truth.depth_m[geometry.rows], truth.x_px[geometry.rows]
+    near_m, far_m = geometry.depth_range_m
+    with np.errstate(invalid="ignore"):
+        inside = (depth_m >= near_m) & (depth_m <= far_m) & ~geometry.defects
+    column = geometry.column_of(depth_m)
+    nearest = np.rint(np.nan_to_num(column)).astype(np.int64)
+    x, row = np.arange(depth_m.shape[1]), np.arange(len(depth_m))[:, None]
+    off = np.full(depth_m.shape, np.inf)
+    for step in (-1, 0, 1):
+        stripe = stripes[row, np.clip(nearest + step, 0, geometry.columns - 1)]
+        off = np.fmin(off, np.abs(stripe - x))
+    lit = np.isfinite(column) & (off <= SAME_PX)
+    return inside & lit if truth.trusted is None else inside & lit & truth.trusted[geometry.rows]
+
+
+def score(answer: Answer, truth: SweepTruth, geometry: ColumnGeometry, scored: Bools) -> Score:
+    """Score an answer. scored: from `scored_pixels`, at least one pixel, else ValueError."""
+    if not scored.any():
+        raise ValueError("no pixel can be scored: the source lights nothing that the camera sees and knows")
+    true_m = truth.depth_m[geometry.rows][scored].astype(np.float64)
+    depth_m = answer.depth_m[scored].astype(np.float64)
+    given = np.isfinite(depth_m)
+    off_m = np.abs(depth_m - true_m)
+    off_px = geometry.px_per_inverse_depth * np.abs(1 / np.where(given, depth_m, 1.0) - 1 / true_m)
+    good = given & (np.where(given, off_m, np.inf) <= GOOD * true_m)
+    sure = given & (answer.confidence[scored] >= CONFIDENT)
+    return Score(
+        pixels=len(true_m),
+        mean_px=float(np.where(given, np.minimum(off_px, MISSING_PX), MISSING_PX).mean()),
+        median_px=float(np.median(off_px[given])) if given.any() else None,
+        median_m=float(np.median(off_m[given])) if given.any() else None,
+        good=float(good.mean()),
+        valid=float(given.mean()),
+        confident_wrong=float((sure & ~good).mean()),
+    )
