@@ -69,7 +69,8 @@ def limit_j(laser_class: Literal["1", "2", "3R", "3B"], duration_s: float, wavel
         return 0.03 if duration_s < 0.06 else 0.5 * duration_s
     if laser_class != "1" and duration_s >= 0.25:
         return (1e-3 if laser_class == "2" else 5e-3) * duration_s
-    return (5.0 if laser_class == "3R" else 1.0) * _class_1_j(duration_s, wavelength_m)
+    class_1_j = _class_1_j(duration_s, wavelength_m)
+    return 5.0 * class_1_j if laser_class == "3R" else class_1_j
 
 
 def _class_1_j(duration_s: float, wavelength_m: float) -> float:
@@ -78,11 +79,11 @@ def _class_1_j(duration_s: float, wavelength_m: float) -> float:
     if duration_s < GROUPED_S:
         return 7.7e-8
     if duration_s < 10:
-        return 7e-4 * duration_s**0.75
+        return 7e-4 * math.pow(duration_s, 0.75)
     heat_j = 3.9e-4 * duration_s
     if wavelength_m >= BLUE_TO_M:
         return heat_j
-    c3 = 10 ** (0.02 * max(wavelength_m * 1e9 - 450, 0.0))
+    c3 = math.pow(10.0, 0.02 * max(wavelength_m * 1e9 - 450, 0.0))
     return min(heat_j, 3.9e-3 * c3 if duration_s < 100 else 3.9e-5 * c3 * duration_s)
 
 
@@ -142,7 +143,7 @@ class Field:
         return Beam(power_w, map_s * self.across, 1 / map_s), Beam(power_w)
 
     def pattern(self) -> tuple[Beam, Beam]:
-        """A projector's picture with half of its columns lit: the pupil may lie in lit columns alone, twice the mean."""
+        """A projector's picture with half of its columns lit: the pupil may lie in lit columns alone."""
         beam = Beam(min(2 * self.of_picture, 1.0) * self.power_w)
         return beam, beam
 
