@@ -69,16 +69,19 @@ def followed(folder: Path | None, switch: Switch | None) -> Iterator[None]:
         yield
         return
     over = threading.Event()
-    state = (folder / STATE).open("wb", buffering=0)
-    hold(state.fileno())
-    thread = threading.Thread(target=_follow, args=(folder, switch, state, over), name="record switch", daemon=True)
-    thread.start()
     try:
-        yield
+        with (folder / STATE).open("wb", buffering=0) as state:
+            hold(state.fileno())
+            thread = threading.Thread(
+                target=_follow, args=(folder, switch, state, over), name="record switch", daemon=True
+            )
+            thread.start()
+            try:
+                yield
+            finally:
+                over.set()
+                thread.join()
     finally:
-        over.set()
-        thread.join()
-        state.close()
         for name in (STATE, WISH):
             with suppress(OSError):
                 (folder / name).unlink(missing_ok=True)

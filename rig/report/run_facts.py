@@ -15,13 +15,12 @@ from calibration.files.npy_files import load_array, load_arrays
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
-from drivers.json_text import parse_json
 from drivers.recorded.contents import INDEX_FILE
 from rig.errors import RigError, UsageError
 from rig.recording.map_rows import MapRows, RowCounts
 from rig.run_folder.manifest import MANIFEST, read_manifest
 from rig.run_folder.pictures import Picture, intensity_picture
-from rig.run_folder.runs import SUMMARY
+from rig.run_folder.runs import SUMMARY, read_summary
 from rig.simd import Float32
 
 ROWS: Final = 5
@@ -95,7 +94,7 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     """
     reader = _Reader(folder)
     manifest = reader.file(MANIFEST, _manifest, "the manifest") or {}
-    summary = reader.file(SUMMARY, _json, "the summary") or {}
+    summary = reader.file(SUMMARY, _summary, "the summary") or {}
     recorded = (folder / INDEX_FILE).exists()
     numbers = tuple(sorted(int(file.stem) for file in folder.glob("stripe/*.npz") if file.stem.isdigit()))
     counted = _counted_maps(folder, reader) if recorded else None
@@ -115,7 +114,7 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     elif counted is not None and shown is not None:
         reader.missing.append(f"The frames of map {shown} are not whole in the recording, so it has no counts.")
     elif not recorded:
-        reader.missing.append("The frames were not recorded, so rows are shown without their counts.")
+        reader.missing.append(_without_frames(manifest))
     facts["model"] = reader.get("calibration", lambda: _model(folder, manifest), "the calibration")
     if facts["model"] is None and (manifest.get("calibration") or {}).get("id"):
         reader.missing.append("The calibration is neither in the run nor where its config says, or has changed since.")
@@ -137,7 +136,8 @@ class _Reader:
             self.missing.append(f"There is no {name} ({what}).")
         except (OSError, ValueError, KeyError, RigError, DeviceError, CalibrationError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            self.missing.append(f"{what.capitalize()} cannot be read: {reason.rstrip('.')}.")
+            reason = reason.removeprefix(f"{name} cannot be read: ").rstrip(".")
+            self.missing.append(f"{what.capitalize()} cannot be read: {reason}.")
         return None
 
     def file(self, name: str, read: Callable[[Path], Read], what: str) -> Read | None:
@@ -194,6 +194,15 @@ def _counts(reader: _Reader, counted: MapRows, number: int, found: Mapping[str, 
     return reader.get("frames", read, "the recording's frames") or {}
 
 
+def _without_frames(manifest: Mapping[str, Any]) -> str:
+    """Why rows have no counts, if the frames do not lie in the run's folder."""
+    parts = [part.get("folder") for part in (manifest.get("on_request") or {}).get("parts") or ()]
+    if not parts:
+        return "The frames were not recorded, so rows are shown without their counts."
+    named = f"{parts[0]} and {len(parts) - 1} more parts" if len(parts) > 1 else parts[0]
+    return f"The frames were recorded in {named}, of which rig report makes pages; here rows are without their counts."
+
+
 def _model(folder: Path, manifest: Mapping[str, Any]) -> RigModel | None:
     """The calibration of a run: its own, or the file that its config names if that is still the same one."""
     wanted = (manifest.get("calibration") or {}).get("id")
@@ -214,11 +223,10 @@ def _manifest(file: Path) -> dict[str, Any]:
     return content
 
 
-def _json(file: Path) -> dict[str, Any]:
-    content = parse_json(file.read_bytes())
-    if not isinstance(content, dict):
-        raise ValueError(f"{file.name} is no object")
-    return content
+def _summary(file: Path) -> Mapping[str, Any]:
+    if not file.exists():
+        raise FileNotFoundError(file)
+    return read_summary(file.parent)
 
 
 def _stripe(file: Path) -> dict[str, Float32]:

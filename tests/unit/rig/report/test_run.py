@@ -77,6 +77,8 @@ def test_five_rows_are_shown_with_depth_and_light(run: Path) -> None:
         ({"calibrated": False}, "Without a calibration there is no depth."),
         ({"maps": 0}, "No map was made."),
         ({}, "The frames were not recorded, so rows"),
+        ({"of_manifest": {"on_request": {"parts": [{"folder": "part-000"}]}}}, "The frames were recorded in part-000,"),
+        ({"of_manifest": {"on_request": {"parts": [{"folder": f"part-00{i}"} for i in range(3)]}}}, "and 2 more parts"),
         ({}, "The calibration is neither in the run nor where its config says"),
     ],
 )
