@@ -7,7 +7,6 @@ other client notices.
 
 import logging
 import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ from rig.errors import UsageError
 from rig.live.slot import SlotReader
 from rig.requests import StreamRequest
 from rig.stream.messages import MOST_HELLO, Hello, MessageKind, message, read_hello
-from rig.view.access import Access
+from rig.view.access import Access, listen
 
 _log = logging.getLogger(__name__)
 
@@ -69,8 +68,8 @@ class DepthServer:
     """
 
     def __init__(self, request: StreamRequest) -> None:
-        self._access = access = Access.to(request.host, request.port, request.token)
-        self.token = access.token
+        self._listening, self._access = listen(Access.to(request.host, request.port, request.token))
+        self.token = self._access.token
         """The token that clients must send; None for nobody."""
         self.counts = StreamCounts()
         self._newest = _Newest()
@@ -78,19 +77,6 @@ class DepthServer:
         self._over = threading.Event()
         self._clients: set[socket.socket] = set()
         self._served = 0
-        family = socket.AF_INET6 if ":" in access.address else socket.AF_INET
-        self._listening = socket.socket(family, socket.SOCK_STREAM)
-        try:
-            if sys.platform != "win32":  # there it lets others take the port
-                self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._listening.bind((access.address, request.port))
-            self._listening.listen(MOST_CLIENTS)
-        except OSError as error:
-            self._listening.close()
-            raise UsageError(
-                f"cannot listen on {access.address} port {request.port}: {error.strerror or error}; choose another "
-                "`port`, or 0 for any free one"
-            ) from error
         self.address: tuple[str, int] = self._listening.getsockname()[:2]
         self._threads = [
             threading.Thread(target=work, name=name, daemon=True)

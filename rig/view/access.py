@@ -1,4 +1,5 @@
-"""Decides who may see the page: checks of Host, Origin and token, the same for the page, its files and its web sockets.
+"""Decides who may see the page: its address, and checks of Host, Origin and token, the same for the page, its files and
+its web sockets.
 
 A browser sends requests to the page on behalf of any page that it shows. Three things keep strangers out. `Host` must
 name this computer: a foreign page whose name its owner has pointed to this computer (DNS rebinding) still sends its own
@@ -9,11 +10,12 @@ sent on behalf of other pages.
 
 import hmac
 import ipaddress
+import os
 import re
 import secrets
 import socket
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
@@ -144,3 +146,21 @@ class Access:
 def is_loopback(address: str) -> bool:
     """Whether only programs on this computer reach an IP address."""
     return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+
+
+def listen(access: Access) -> tuple[socket.socket, Access]:
+    """A socket that listens, and the rules with the port that it has got. On `::` it takes connections of IPv4 too.
+
+    Raises UsageError if the port is busy or the address is none of this computer's.
+    """
+    family = socket.AF_INET6 if ":" in access.address else socket.AF_INET
+    both = access.address == "::" and socket.has_dualstack_ipv6()
+    try:
+        listening = socket.create_server((access.address, access.port), family=family, backlog=64, dualstack_ipv6=both)
+    except OSError as error:
+        reason = os.strerror(error.errno).lower() if error.errno else str(error)
+        raise UsageError(
+            f"cannot listen on port {access.port} of {access.address}: {reason}; end what uses it, or name another "
+            "`port` or `host`"
+        ) from None
+    return listening, replace(access, port=listening.getsockname()[1])

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import io
 import logging
-import os
 import socket
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, replace
@@ -57,21 +56,6 @@ def require_viser() -> None:
         raise UsageError(f"rig view needs viser; install it: {install_command('viser')}") from error
 
 
-def listen(access: Access) -> tuple[socket.socket, Access]:
-    """A socket that listens, and the rules with the port that it has got. Raises UsageError if the port is busy or the
-    address is none of this computer's."""
-    family = socket.AF_INET6 if ":" in access.address else socket.AF_INET
-    try:
-        listening = socket.create_server((access.address, access.port), family=family, backlog=64)
-    except OSError as error:
-        reason = os.strerror(error.errno).lower() if error.errno else str(error)
-        raise UsageError(
-            f"cannot listen on port {access.port} of {access.address}: {reason}; end what uses it, or name another "
-            "`port` or `host`"
-        ) from None
-    return listening, replace(access, port=listening.getsockname()[1])
-
-
 @dataclass(slots=True)
 class _Route:
     """Counts the web sockets of one path."""
@@ -81,7 +65,8 @@ class _Route:
 
 
 class ViewServer:
-    """Serves until `close`. access, listening: from `listen`. download: makes the file of POINTS, on a thread.
+    """Serves until `close`. access, listening: from `rig.view.access.listen`. download: makes the file of POINTS, on a
+    thread.
 
     viser: its server, for the scene. Raises RuntimeError if this version of viser opens its port in another way.
     """

@@ -23,12 +23,12 @@ from rig.recording.map_rows import RowCounts
 from rig.requests import ViewRequest
 from rig.simd import Float32
 from rig.view import health
-from rig.view.access import Access
+from rig.view.access import Access, listen
 from rig.view.estimation import Estimated, Estimation, EstimationRequest
 from rig.view.live_source import LiveNews, LiveSource, LiveState
 from rig.view.pages import Pages, PageWish
 from rig.view.run_source import RunSource, read_map
-from rig.view.server import ViewServer, listen, require_viser
+from rig.view.server import ViewServer, require_viser
 from rig.view.shown import COLOURS, Legend, Limits, ShownMap, picture_of, ply_of, points, steady_limits
 
 MOST_POINTS: Final = 250_000

@@ -93,4 +93,4 @@ def test_a_port_that_is_taken_is_refused_in_one_line(rig: Rig) -> None:
         ran = rig("stream", "--port", port)
     assert (ran.code, len(ran.problems)) == (2, 1)
     assert f"port {port}" in ran.problems[0]
-    assert "choose another --port" in ran.problems[0]
+    assert "name another --port or --host" in ran.problems[0]

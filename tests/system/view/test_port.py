@@ -22,9 +22,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from rig.errors import UsageError
-from rig.view.access import Access
+from rig.view.access import Access, listen
 from rig.view.pages import MOST_PAGES, Pages
-from rig.view.server import ViewServer, listen, require_viser
+from rig.view.server import ViewServer, require_viser
 from tests.system.conftest import Rig
 from tests.system.view.conftest import PATIENCE_S, Served, served
 

@@ -272,7 +272,7 @@ def test_a_taken_port_a_short_token_and_a_foreign_address_are_refused_in_one_lin
     for request, told in (
         (StreamRequest(port=server.address[1]), f"port {server.address[1]}"),
         (StreamRequest(port=0, token="short"), "`token` has 5 characters"),
-        (StreamRequest(port=0, host="192.0.2.1"), "cannot listen on 192.0.2.1"),
+        (StreamRequest(port=0, host="192.0.2.1"), "cannot listen on port 0 of 192.0.2.1"),
         (StreamRequest(port=70000), "`port` is 70000"),
     ):
         with pytest.raises(UsageError, match=re.escape(told)) as refused:

@@ -1,13 +1,14 @@
 """Who may see the page: every check of Host, Origin and token, for files and for web sockets."""
 
 from dataclasses import replace
+from socket import create_connection, has_dualstack_ipv6
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.errors import UsageError
-from rig.view.access import Access, Asked, is_loopback
+from rig.view.access import Access, Asked, is_loopback, listen
 
 TOKEN = "a-token-that-is-long-enough"
 HERE = Access("127.0.0.1", 8765, None, frozenset({"localhost"}))
@@ -131,3 +132,18 @@ def test_loopback_is_known() -> None:
     assert [is_loopback(one) for one in ("127.0.0.1", "127.3.2.1", "::1", "0.0.0.0", "10.0.0.1", "fe80::1%eth0")] == [
         True, True, True, False, False, False,
     ]  # fmt: skip
+
+
+@pytest.mark.skipif(not has_dualstack_ipv6(), reason="no IPv6 here")
+def test_all_addresses_of_ipv6_are_those_of_ipv4_too() -> None:
+    listening, access = listen(Access.to("::", 0, None))
+    with listening:
+        assert access.token is not None
+        for address in ("127.0.0.1", "::1"):
+            create_connection((address, access.port), timeout=10).close()
+
+
+def test_a_port_is_bound_by_one_server_alone() -> None:
+    listening, access = listen(Access.to("127.0.0.1", 0, None))
+    with listening, pytest.raises(UsageError, match=f"port {access.port} of 127.0.0.1: address already in use; end wh"):
+        listen(access)
