@@ -19,11 +19,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.interfaces import Spent
+from drivers.interfaces import PulseTimes, Spent
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.frames.flux import FluxModel
 from sim_backend.projector.draws import SensorBits, add_counts, readings
 from sim_backend.projector.hardware import ConventionalCamera, PulsedSource
+from sim_backend.projector.pulse import echoes, first_photons, gate
+from sim_backend.projector.stereo import ambient_radiance, first_view, second_view
 from sim_backend.projector.transport import Float32, Moment, Rows, Transport, blocks
 
 Rule = Literal["energy", "irradiance"]
@@ -88,6 +90,7 @@ class SimulatedApparatus:
         self._light_per_s = (
             transport.steady_per_s - flux.steady[DARK][rows] if DARK in flux.steady else (transport.steady_per_s)
         )
+        self._setting = setting
         self._rows_of_fan = rows_of_fan(setting)[rows]
         self._rng = np.random.default_rng(request.seed)
         self._time_s = self._energy_j = 0.0
@@ -169,6 +172,36 @@ class SimulatedApparatus:
                 add_counts(self._rng, turn[some], seen.swapaxes(0, 1), some, counts)
         self._spend(lasts_s, lit_w)
         return counts[:, 0]
+
+    def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
+        """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
+        pixel detects after each pulse: see `sim_backend.projector.pulse`.
+
+        Raises ValueError for less than one pulse, for bins that do not fit into the gate, and for more counts than
+        memory should hold.
+        """
+        (number,) = _frames(np.array([pulses]), 1).tolist()
+        power_w = self._request.power_w * (2 if self._request.rule == "irradiance" else 1)
+        back = echoes(self._setting, self.rows, self._transport.steady_per_s)
+        opened = gate(self._hardware.pulses, self._request.depth_range_m, back.stretch, bin_s)
+        counts = first_photons(self._rng, back, opened, number, power_w * self.spad_frame_s, self._bits)
+        self._spend(np.array([number * self.spad_frame_s]), np.array([power_w]))
+        return PulseTimes(counts, opened.start_s, bin_s, number)
+
+    def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
+        """Images of two conventional cameras in ambient light only, without the narrow filter: uint16 (2, rows, width).
+
+        The second one stands where the light leaves the mirror: see `sim_backend.projector.stereo`. Raises ValueError
+        for an exposure shorter than `camera_frame_s`.
+        """
+        self._check_exposure(exposure_s)
+        camera, setting = self._hardware.camera, self._setting
+        views = first_view(setting.view, self.rows), second_view(setting.view, self.rows)
+        radiance = np.stack([ambient_radiance(setting, seen, camera.broad_filter) for seen in views])
+        per_s = self._electrons * setting.gain * radiance + camera.dark_current
+        images = readings(self._rng, exposure_s * per_s, camera)
+        self._spend(np.array([exposure_s]), np.zeros(1))
+        return images
 
     @property
     def _column_w(self) -> float:

@@ -34,6 +34,19 @@ LEAST_CHANCE = 1e-25
 
 
 @numba.njit(cache=True, nogil=True)
+def inverted(uniform: float, frames: int, flux: float) -> int:
+    """Number of frames in which a pixel fires, for a flux of up to ln 2 and a uniform number in 0..1, by inversion."""
+    chance, odds = math.exp(-frames * flux), math.expm1(flux)
+    left = uniform - chance
+    found = 0
+    while left > 0.0 and found < frames and chance > LEAST_CHANCE:
+        found += 1
+        chance *= odds * (frames - found + 1) / found
+        left -= chance
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
 def count(rng: np.random.Generator, frames: int, flux: float) -> int:
     """Number of frames out of `frames` in which a pixel fires that detects `flux` photons in a frame."""
     if not flux > 0.0 or frames <= 0:
@@ -43,24 +56,11 @@ def count(rng: np.random.Generator, frames: int, flux: float) -> int:
         return frames
     if dark >= 0.5:
         if frames * (1.0 - dark) <= INVERSION:
-            return _inverted(rng, frames, flux)
+            return inverted(rng.random(), frames, flux)
     elif frames * dark <= INVERSION:
         # The frames without a count are counted, with the flux that makes them so frequent.
-        return frames - _inverted(rng, frames, -math.log1p(-dark))
+        return frames - inverted(rng.random(), frames, -math.log1p(-dark))
     return int(rng.binomial(frames, 1.0 - dark))
-
-
-@numba.njit(cache=True, nogil=True)
-def _inverted(rng: np.random.Generator, frames: int, flux: float) -> int:
-    """`count` by inversion, for a flux below ln 2."""
-    chance, odds = math.exp(-frames * flux), math.expm1(flux)
-    left = rng.random() - chance
-    found = 0
-    while left > 0.0 and found < frames and chance > LEAST_CHANCE:
-        found += 1
-        chance *= odds * (frames - found + 1) / found
-        left -= chance
-    return found
 
 
 @numba.njit(cache=True, nogil=True)
@@ -110,10 +110,10 @@ class SensorBits:
             self._blind = blind_probability(sensor.dead_time, times)
         self._crosstalk = sensor.crosstalk / 4 if "crosstalk" in names else 0.0
         self._errors = sensor.bit_error_rate if "bit errors" in names else 0.0
-        self._dead, self._hot = None, None
+        self.dead, self.hot = None, None
         if "hot and dead pixels" in names:
             dead, hot = defects(sensor, flux.setting.view.u.shape)
-            self._dead, self._hot = dead[rows], hot[rows]
+            self.dead, self.hot = dead[rows], hot[rows]
         self.none = not names
         """Whether the bits stay as they are."""
 
@@ -127,8 +127,8 @@ class SensorBits:
             beside = np.pad(p, ((0, 0), (0, 0), (1, 1)))
             quiet = (1 - self._crosstalk * beside[..., 2:]) * (1 - self._crosstalk * beside[..., :-2])
             p = 1.0 - (1.0 - p) * quiet * (1 - self._crosstalk * p) ** 2
-        if self._dead is not None and self._hot is not None:
-            p = np.where(self._hot[rows, None], 1.0, np.where(self._dead[rows, None], 0.0, p))
+        if self.dead is not None and self.hot is not None:
+            p = np.where(self.hot[rows, None], 1.0, np.where(self.dead[rows, None], 0.0, p))
         p = p + self._errors * (1.0 - 2.0 * p)
         with np.errstate(divide="ignore"):
             return np.asarray(-np.log1p(-np.clip(p, 0.0, 1.0)))

@@ -82,8 +82,7 @@ class Transport:
         """Detections per second without the source, float64 (rows, width): ambient light and dark counts."""
         self._still = [effect for effect in flux.laser.values() if hold_s(effect) == 0]
         self._moving = [effect for effect in flux.laser.values() if isinstance(effect, ParticleLight)]
-        ends = np.flatnonzero(np.diff(rows) > 1) + 1
-        self._runs = [(int(run[0]), int(run[-1]) + 1) for run in np.split(rows, ends)]
+        self._runs = runs(rows)
         count = len(commands)
         lit = ONE_LINE.sheets(model.sheets, commands, self._view.rows, [0.0] * count, model.scanner.command_range)
         self._sheets = [sheets[0] if sheets else None for sheets in lit]
@@ -247,6 +246,11 @@ def _add_moment(
                 if w != 0.0:
                     for i in range(start, start + number[c, first_row + y]):
                         found[y, p, at[i]] += w * value[i]
+
+
+def runs(rows: Rows) -> list[tuple[int, int]]:
+    """The ascending rows as runs of neighbours: (first row, row after the last)."""
+    return [(int(run[0]), int(run[-1]) + 1) for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)]
 
 
 def checked_rows(rows: ArrayLike, height: int) -> Rows:
