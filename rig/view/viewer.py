@@ -447,6 +447,8 @@ class _ShowsRun(_Shows):
                 self._shown, self._estimated_again = replace(found, number=asked.number), True
                 took_s = float(made.summary.get("compute_time_s") or 0.0)
                 self._label = f"map {asked.number}, estimated again with {asked.estimator} in {took_s:.2g} s"
+                if asked.number and not asked.by_cutting:
+                    self._label += ", maps before it included"
                 self.tell_map()
                 again = health.fog_of(made.summary.get("fog"))
                 self._tell_fog({asked.number: {"map": asked.number, **again}} if again else {})
