@@ -186,7 +186,8 @@ class ColumnGeometry:
         while np.any(high - low > 1):
             middle = (low + high) // 2
             beyond = (self._inverse(middle.astype(np.float64)) > inverse) == self._rises
-            high, low = np.where(beyond, middle, high), np.where(beyond, low, middle)
+            wide = high - low > 1  # the others have found their two columns
+            high, low = np.where(wide & beyond, middle, high), np.where(wide & ~beyond, middle, low)
         one, other = self._inverse(low.astype(np.float64)), self._inverse(high.astype(np.float64))
         step = other - one
         with np.errstate(all="ignore"):
