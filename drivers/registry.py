@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from drivers.clock import Clock, SystemClock
 from drivers.errors import LimitExceeded, UnknownKind
 from drivers.interfaces import World
+from drivers.optional_packages import added
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import Tap
 from drivers.units import IN_NAMES, dimension_of, format_quantity
@@ -142,4 +143,4 @@ def load_entry(slot: str, kind: str, entries: Iterable[EntryPoint], wanted: type
 def _entries(slot: str) -> tuple[EntryPoint, ...]:
     if slot not in SLOTS:
         raise ValueError(f"no slot {slot!r} in a rig; slots are {', '.join(SLOTS)}")
-    return tuple(entry_points(group=f"spadrig.{slot}"))
+    return added(f"spadrig.{slot}")

@@ -4,8 +4,9 @@ An estimator of another package is an entry point of the group `spadrig.estimato
 This module imports little, since shells ask for the names at every Tab.
 """
 
-from importlib.metadata import entry_points
 from typing import Final
+
+from drivers.optional_packages import added
 
 AUTO: Final = "auto"
 """Setting that chooses the estimator: `joint` where it keeps up with the frames, else `likelihood`."""
@@ -17,7 +18,7 @@ SLOT: Final = "estimator"
 
 def estimator_names() -> tuple[str, ...]:
     """Names of all installed estimators: ours, then those of other packages, sorted. Imports none of them."""
-    others = {entry.name for entry in entry_points(group=f"spadrig.{SLOT}")} - {AUTO, *ESTIMATORS}
+    others = {entry.name for entry in added(f"spadrig.{SLOT}")} - {AUTO, *ESTIMATORS}
     return (*ESTIMATORS, *sorted(others))
 
 

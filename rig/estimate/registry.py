@@ -8,9 +8,9 @@ for bit, from the learned state that was kept with each of them.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from drivers.optional_packages import added
 from rig.config.estimators import ESTIMATORS as ESTIMATORS
 from rig.config.estimators import SLOT
 from rig.errors import UsageError
@@ -159,7 +159,7 @@ def _kind(name: str) -> EstimatorKind:
     from drivers.registry import load_entry
 
     try:
-        return load_entry(SLOT, name, entry_points(group=f"spadrig.{SLOT}"), EstimatorKind)
+        return load_entry(SLOT, name, added(f"spadrig.{SLOT}"), EstimatorKind)
     except UnknownKind as error:
         raise UsageError(str(error)) from error
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError
+from pathlib import Path
 
 import pytest
 
@@ -23,3 +24,15 @@ def test_the_package_is_installed_in_the_version_that_is_needed(
 ) -> None:
     monkeypatch.setattr(optional_packages, "requires", requires)
     assert optional_packages.install_command("zstandard") == f'"{sys.executable}" -m pip install "{wanted}"'
+
+
+def test_what_a_package_adds_is_found_as_soon_as_it_is_on_the_import_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = "spadrig.laser"
+    ours = {entry.name for entry in optional_packages.added(group)}
+    about = tmp_path / "lamp-1.dist-info"
+    about.mkdir()
+    (about / "entry_points.txt").write_text(f"[{group}]\nlamp = lamp:KIND\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert {entry.name for entry in optional_packages.added(group)} == {*ours, "lamp"}

@@ -27,11 +27,11 @@ INSTALLED = (
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def entry_points(group: str) -> list[EntryPoint]:
+    def added(group: str) -> tuple[EntryPoint, ...]:
         known = INSTALLED if group == "spadrig.laser" else ()
-        return [EntryPoint(name, f"{__name__}:{value}", group) for name, value in known]
+        return tuple(EntryPoint(name, f"{__name__}:{value}", group) for name, value in known)
 
-    monkeypatch.setattr(registry, "entry_points", entry_points)
+    monkeypatch.setattr(registry, "added", added)
 
 
 def test_kinds_are_listed_once_and_sorted_and_one_that_is_found_creates_its_device() -> None:
