@@ -73,7 +73,7 @@ def test_every_key_of_a_config_has_a_meaning_in_the_reference() -> None:
 
 def test_every_command_has_a_section_with_its_options() -> None:
     text = fill((ROOT / "docs" / "reference" / "commands.md").read_text())
-    for name, command in commands(typer.main.get_command(app), "rig"):
+    for name, command in commands(rig(), "rig"):
         section = re.search(rf"^#+ {name}\n(.*?)(?=^#|\Z)", text, re.M | re.S)
         if name != "rig":
             assert section is not None, name
@@ -188,10 +188,22 @@ def test_command_lines_in_configs_and_messages_parse() -> None:
                 assert refused(words, is_whole=False) is None, f"{file}: {line}: {refused(words, is_whole=False)}"
 
 
+@cache
+def rig() -> Any:
+    """The command line itself."""
+    return typer.main.get_command(app)
+
+
+@cache
+def known_options() -> set[str]:
+    """Options of the command line and of programs beside the tests."""
+    scripts = "".join(file.read_text() for file in (ROOT / "tests").rglob("*.py"))
+    return options(rig()) | set(re.findall(r'add_argument\("(--[a-z-]+)"', scripts))
+
+
 @pages
 def test_options_exist(page: Path) -> None:
-    scripts = "".join(file.read_text() for file in (ROOT / "tests").rglob("*.py"))
-    known = options(typer.main.get_command(app)) | set(re.findall(r'add_argument\("(--[a-z-]+)"', scripts))
+    known = known_options()
     for code in inline_code(page.read_text()):
         if code.startswith("--"):
             named = set(re.findall(r"--[a-z-]+", code))
@@ -282,7 +294,7 @@ def refused(words: list[str], is_whole: bool) -> str | None:
 
     is_whole: nothing that it needs may be missing. Values in capitals stand for any.
     """
-    command, name = typer.main.get_command(app), "rig"
+    command, name = rig(), "rig"
     rest = ["1" if re.fullmatch(r"[A-Z_]+", word) else word for word in words[1:]]
     while hasattr(command, "commands") and rest and not rest[0].startswith("-"):
         if rest[0] not in command.commands:
@@ -300,10 +312,10 @@ def refused(words: list[str], is_whole: bool) -> str | None:
             raise
         lacks = type(error).__name__ in ("MissingParameter", "BadOptionUsage", "NoArgsIsHelpError")
         return None if lacks and not is_whole else str(error.format_message())
-    for key, known in (("config", bundled_rigs()), ("scene", bundled_scenes())):
+    for key, bundled in (("config", bundled_rigs), ("scene", bundled_scenes)):
         asked = given.get(key)
         is_name = isinstance(asked, str) and asked != "1" and not re.search(r"[./]", asked)
-        if is_name and asked not in [one.name for one in known]:
+        if is_name and asked not in [one.name for one in bundled()]:
             return f"{asked} is no bundled {'rig' if key == 'config' else 'scene'}"
     return None
 
