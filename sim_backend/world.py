@@ -262,7 +262,7 @@ class SimulatedWorld:
             with np.errstate(divide="ignore"):
                 depth = (1 / surface_passed(still, x_px, at_s)).astype(np.float32)
         depth[~np.isfinite(depth) | np.isnan(still.u)] = np.nan
-        return SweepTruth(x_px=x_px, depth_m=depth)
+        return SweepTruth(x_px=x_px, depth_m=depth, trusted=self.surfaces.trusted)
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
         """Each effect as planned: on or off, why, its share of the photons, what it can change and what it costs."""

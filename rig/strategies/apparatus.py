@@ -67,9 +67,12 @@ class Apparatus(Protocol):
         """
         ...
 
-    def spots(self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int) -> NDArray[np.uint32]:
+    def spots(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int, brightness: float = 1.0
+    ) -> NDArray[np.uint32]:
         """Light single spots one after the other, each with the whole power for some frames of the SPAD. Returns
         (spots, width), the counts of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,).
+        brightness: share of the power, above 0 and at most 1.
         """
         ...
 

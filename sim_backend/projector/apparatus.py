@@ -24,9 +24,9 @@ from sim_backend.effects.setting import Array, Setting
 from sim_backend.frames.flux import FluxModel
 from sim_backend.projector.draws import SensorBits, add_counts, readings
 from sim_backend.projector.hardware import ConventionalCamera, PulsedSource
-from sim_backend.projector.pulse import echoes, first_photons, gate
+from sim_backend.projector.pulse import blur_s, echoes, first_photons, gate
 from sim_backend.projector.stereo import ambient_radiance, first_view, second_view
-from sim_backend.projector.transport import Float32, Moment, Rows, Transport, blocks
+from sim_backend.projector.transport import Float32, Moment, Transport, blocks
 
 Rule = Literal["energy", "irradiance"]
 Counts = NDArray[np.uint32]
@@ -83,6 +83,7 @@ class SimulatedApparatus:
         self.spad_frame_s = request.frame_s
         self.camera_frame_s = 1 / camera.frame_rate
         self.camera_full_scale = 2**camera.bits - 1
+        self.pulse_sigma_s = blur_s(hardware.pulses)
         self._transport, self._hardware, self._request = transport, hardware, request
         self._bits = SensorBits(flux, rows, request.frame_s)
         self._electrons = camera.quantum_efficiency * camera.fill_factor
@@ -112,12 +113,17 @@ class SimulatedApparatus:
         watts, lit_w = self._watts(shown)
         lasts_s = np.asarray(number * self.spad_frame_s, np.float64)
         moments, of_moment = self._when(lasts_s)
+        turns = [
+            (moment, np.flatnonzero(turn), turn)
+            for moment, turn in zip(moments, _whole(of_moment, number), strict=True)
+        ]
         counts = np.zeros((len(shown), len(self.rows), self.width), np.uint32)
-        for moment, turn in zip(moments, _whole(of_moment, number), strict=True):
-            some = np.flatnonzero(turn)
-            for part, light in self._lit(watts, some, moment):
-                flux = self.spad_frame_s * (self._transport.steady_per_s[part, None] + light)
-                add_counts(self._rng, turn[some], self._bits.seen(flux, part), some, counts[:, part])
+        for part, of_part, light in self._lit(watts):
+            steady_per_s = self._transport.steady_per_s[part, None]
+            for moment, some, turn in turns:
+                of_turn = self._transport.at_moment(light[:, some], of_part[:, some], part, moment)
+                seen = self._bits.seen(self.spad_frame_s * (steady_per_s + of_turn), part)
+                add_counts(self._rng, turn[some], seen, some, counts[:, part])
         self._spend(lasts_s, lit_w)
         return counts
 
@@ -133,25 +139,27 @@ class SimulatedApparatus:
         lasts_s = np.full(len(shown), exposure_s)
         moments, shares = self._when(lasts_s)
         images = np.zeros((len(shown), len(self.rows), self.width), np.uint16)
-        for part in blocks(len(self.rows), len(shown), self.width):
-            light = np.zeros((part.stop - part.start, len(shown), self.width))
+        for part, of_part, light in self._lit(watts):
+            mean = np.zeros(light.shape)
             for moment, share in zip(moments, shares, strict=True):
                 some = np.flatnonzero(share)
-                light[:, some] += share[some, None] * self._transport.of_patterns(
-                    _some(watts, some, part), moment, part
-                )
-            per_s = self._electrons * (self._light_per_s[part, None] + light) + self._hardware.camera.dark_current
+                of_moment = self._transport.at_moment(light[:, some], of_part[:, some], part, moment)
+                mean[:, some] += share[some, None] * of_moment
+            per_s = self._electrons * (self._light_per_s[part, None] + mean) + self._hardware.camera.dark_current
             images[:, part] = readings(self._rng, exposure_s * per_s, self._hardware.camera).swapaxes(0, 1)
         self._spend(lasts_s, lit_w)
         return images
 
-    def spots(self, rows: ArrayLike, columns: ArrayLike, frames: int) -> Counts:
+    def spots(self, rows: ArrayLike, columns: ArrayLike, frames: int, brightness: float = 1.0) -> Counts:
         """Light single spots one after the other, each for some frames of the SPAD. Returns uint32 (spots, width), the
         counts of each spot's own row.
 
-        rows: (spots,) indices into `rows`; columns: (spots,). Light that a spot scatters into other rows is left out,
-        and so is what the haze of other rows would add. Raises ValueError for spots that do not exist.
+        rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power. Light that a spot
+        scatters into other rows is left out. Raises ValueError for spots that do not exist, and for another brightness
+        than above 0 to 1.
         """
+        if not 0 < brightness <= 1:
+            raise ValueError(f"brightness of spots is {brightness:g}; it is above 0 and at most 1")
         at_row, at_column = _indices("rows", rows, len(self.rows)), _indices("columns", columns, self.columns)
         if at_row.shape != at_column.shape:
             raise ValueError(f"spots have {len(at_row)} rows and {len(at_column)} columns; give one of each for a spot")
@@ -160,6 +168,7 @@ class SimulatedApparatus:
         power_w, lit_w = self._request.power_w * spread, np.full(len(at_row), self._request.power_w)
         if self._request.rule == "irradiance":
             power_w, lit_w = (np.full(len(at_row), self._column_w), self._column_w / spread)
+        power_w, lit_w = brightness * power_w, brightness * lit_w
         lasts_s = np.asarray(number * self.spad_frame_s, np.float64)
         moments, of_moment = self._when(lasts_s)
         counts = np.zeros((len(at_row), 1, self.width), np.uint32)
@@ -240,10 +249,11 @@ class SimulatedApparatus:
         """As `Transport.moments`, for exposures that follow each other from now on."""
         return self._transport.moments(self._time_s, self._time_s + np.cumsum(lasts_s))
 
-    def _lit(self, watts: Float32, some: Rows, moment: Moment | None) -> Iterator[tuple[slice, Float32]]:
-        """Blocks of rows, and the light in them of some of the patterns."""
-        for part in blocks(len(self.rows), len(some), self.width):
-            yield part, self._transport.of_patterns(_some(watts, some, part), moment, part)
+    def _lit(self, watts: Float32) -> Iterator[tuple[slice, Float32, Float32]]:
+        """Blocks of rows; watts (rows or 1, patterns, columns) and the light in them (rows, patterns, width)."""
+        for part in blocks(len(self.rows), len(watts), self.width):
+            by_row = np.ascontiguousarray(watts[:, part].swapaxes(0, 1)) if watts.ndim == 3 else watts[None]
+            yield part, by_row, self._transport.of_patterns(by_row, part)
 
     def _spend(self, lasts_s: Array, lit_w: Array) -> None:
         self._time_s += float(lasts_s.sum())
@@ -255,10 +265,6 @@ def rows_of_fan(setting: Setting) -> Array:
     view = setting.view
     tangent = view.v[:, view.width // 2]
     return np.asarray(setting.line.fan * (1 + tangent**2) / np.abs(np.gradient(tangent)))
-
-
-def _some(watts: Float32, some: Rows, part: slice) -> Float32:
-    return watts[some] if watts.ndim == 2 else watts[some, part]
 
 
 def _whole(shares: Array, frames: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,14 +1,14 @@
 """Random counts of a one-bit SPAD and of a conventional camera.
 
-A pixel that detects on average lambda photons in a frame reads 1 with probability 1 - exp(-lambda), so of n frames it
-fires in
+A pixel that detects on average L photons in a frame reads 1 with probability 1 - exp(-L), so of n frames it fires in
 
-    N ~ Binomial(n, 1 - exp(-lambda)),    P(N = 0) = exp(-n lambda)
+    N ~ Binomial(n, 1 - exp(-L)),    P(N = 0) = exp(-n L)
 
-drawn exactly: by inversion where few frames fire or few do not (one uniform number, and the chances of 0, 1, 2, ... one
-after the other), otherwise by rejection (`numpy.random.Generator.binomial`, BTPE). A detection rate of 0 never fires,
-an infinite one always. Draws go row by row, pattern by pattern and pixel by pixel, so they do not depend on how
-rows are grouped in calls. Measured on one core: 9 ns a count in the dark, 30 ns at one detection, 90 ns by rejection.
+drawn exactly. Going from pixel to pixel, one exponential variate says how much n L passes until the next pixel that
+fires at all; its count is found by inversion (the chances of 1, 2, 3, ... one after the other) where few frames fire or
+few do not, otherwise by rejection (`numpy.random.Generator.binomial`, BTPE). A flux of 0 never fires, an infinite one
+always. Draws go row by row, pattern by pattern and pixel by pixel, so they do not depend on how rows are grouped.
+Measured on one core: 2 ns for a pixel that does not fire, 40 ns for a few counts, 100 ns for many.
 """
 
 import math
@@ -47,20 +47,32 @@ def inverted(uniform: float, frames: int, flux: float) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def count(rng: np.random.Generator, frames: int, flux: float) -> int:
-    """Number of frames out of `frames` in which a pixel fires that detects `flux` photons in a frame."""
+def next_wait(rng: np.random.Generator) -> float:
+    """An exponential variate: the mean number of counts that passes until the next pixel that fires."""
+    return -math.log(1.0 - rng.random())
+
+
+@numba.njit(cache=True, nogil=True)
+def count(rng: np.random.Generator, wait: float, frames: int, flux: float) -> tuple[int, float]:
+    """Number of frames out of `frames` in which a pixel fires that detects `flux` photons in a frame; and the wait that
+    is left for the next pixel. wait: what the pixel before has left, from `next_wait`."""
+    mean = frames * flux
     if not flux > 0.0 or frames <= 0:
-        return 0
+        return 0, wait
+    if wait >= mean:
+        return 0, wait - mean
+    # With chance exp(-mean) the wait was longer; within it, exp(-wait) is a uniform number above that.
     dark = math.exp(-flux)
     if dark == 0.0:
-        return frames
-    if dark >= 0.5:
-        if frames * (1.0 - dark) <= INVERSION:
-            return inverted(rng.random(), frames, flux)
-    elif frames * dark <= INVERSION:
+        found = frames
+    elif dark >= 0.5 and frames * (1.0 - dark) <= INVERSION:
+        found = inverted(math.exp(-wait), frames, flux)
+    elif dark < 0.5 and frames * dark <= INVERSION:
         # The frames without a count are counted, with the flux that makes them so frequent.
-        return frames - inverted(rng.random(), frames, -math.log1p(-dark))
-    return int(rng.binomial(frames, 1.0 - dark))
+        found = frames - inverted(-math.expm1(-wait), frames, -math.log1p(-dark))
+    else:
+        found = int(rng.binomial(frames, 1.0 - dark))
+    return found, next_wait(rng)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -71,9 +83,11 @@ def add_counts(
     """Add to counts[patterns] (patterns, rows, width) how many frames fire, out of frames (n,) with flux (rows, n,
     width) photons a frame. patterns: (n,)."""
     for y in range(flux.shape[0]):
+        wait = next_wait(rng)
         for i in range(flux.shape[1]):
             for x in range(flux.shape[2]):
-                counts[patterns[i], y, x] += np.uint32(count(rng, frames[i], flux[y, i, x]))
+                found, wait = count(rng, wait, frames[i], flux[y, i, x])
+                counts[patterns[i], y, x] += np.uint32(found)
 
 
 def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCamera) -> NDArray[np.uint16]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.line import edge, edge_sum
 from sim_backend.light.optics import LIGHT_M_PER_S
-from sim_backend.projector.draws import INVERSION, SensorBits, count, inverted
+from sim_backend.projector.draws import SensorBits, count, next_wait
 from sim_backend.projector.hardware import PulsedSource
 from sim_backend.scenes.medium import Rain, Snow
 
@@ -102,10 +102,15 @@ class Gate:
     sigma_s: float
 
 
+def blur_s(source: PulsedSource) -> float:
+    """Standard deviation of the times of photons from a surface: pulse and jitter together."""
+    return math.hypot(source.pulse_width, source.jitter) / FWHM_PER_SIGMA
+
+
 def gate(source: PulsedSource, depth_range_m: tuple[float, float], stretch: tuple[float, float], bin_s: float) -> Gate:
     """The gate that lets in light from a range of depths. stretch: smallest and largest distance per depth. Raises
     ValueError for bins that are not positive or longer than the gate."""
-    sigma_s = math.hypot(source.pulse_width, source.jitter) / FWHM_PER_SIGMA
+    sigma_s = blur_s(source)
     start_s, end_s = (2 * z * q / LIGHT_M_PER_S for z, q in zip(depth_range_m, stretch, strict=True))
     start_s, end_s = max(start_s - GATE_SIGMAS * sigma_s, 0.0), end_s + GATE_SIGMAS * sigma_s
     if not 0 < bin_s <= end_s - start_s:
@@ -164,19 +169,11 @@ def expected(
 @numba.njit(cache=True, nogil=True)
 def time_first(rng: np.random.Generator, pulses: int, mean: Array, counts: NDArray[np.uint32]) -> None:
     """Draw counts (bins,) of first photons in so many pulses, from the mean detections (bins,) of a pulse."""
-    left, wait = pulses, -math.log(1.0 - rng.random())
+    left, wait = pulses, next_wait(rng)
     for i in range(len(mean)):
-        none = left * mean[i]
-        if wait >= none:  # with chance exp(-none), no pulse is detected here
-            wait -= none
-            continue
-        if mean[i] <= math.log(2.0) and none <= INVERSION:
-            found = inverted(math.exp(-wait), left, mean[i])  # goes on with the same random number
-        else:
-            found = count(rng, left, mean[i])
+        found, wait = count(rng, wait, left, mean[i])
         counts[i] = found
         left -= found
-        wait = -math.log(1.0 - rng.random())
 
 
 @numba.njit(cache=True, nogil=True)

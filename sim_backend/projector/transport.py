@@ -41,9 +41,11 @@ from sim_backend.light.sheet import LightSheet
 Float32 = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
+Sparse = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Float32]
+
 MOMENTS = 8
 """Number of moments at which rain and snow are looked at in a call."""
-KEPT_MOMENTS = 16
+KEPT_MOMENTS = 64
 """Moments whose light is kept."""
 GROUP = 16
 """Neighbouring columns for which the drops are chosen together."""
@@ -170,21 +172,27 @@ class Transport:
         none = np.zeros(0, np.float32)
         return Moment(first, number, np.concatenate([none.astype(np.int32), *x]), np.concatenate([none, *value]))
 
-    def of_patterns(self, watts: Float32, moment: Moment | None, rows: slice) -> Float32:
-        """Detections per second from the source, float32 (rows of the slice, patterns, width).
+    def of_patterns(self, watts: Float32, rows: slice) -> Float32:
+        """Detections per second from the source without drops and flakes, float32 (rows of the slice, patterns, width).
 
-        watts: light in each column, (patterns, columns), or (patterns, rows of the slice, columns) where rows differ.
+        watts: light in each column, (1, patterns, columns), or (rows of the slice, patterns, columns) if rows differ.
         """
         light = self.light[rows]
-        by_row = np.ascontiguousarray(watts.swapaxes(0, 1)) if watts.ndim == 3 else watts[None]
-        lit = np.count_nonzero(by_row, axis=2).max(axis=0, initial=0)
-        few = lit * FEW < watts.shape[-1]
-        found = np.zeros((len(light), watts.shape[0], light.shape[2]), np.float32)
+        lit = np.count_nonzero(watts, axis=2).max(axis=0)
+        few = lit * FEW < watts.shape[2]
+        found = np.zeros((len(light), watts.shape[1], light.shape[2]), np.float32)
         if not few.all():
-            found[:, ~few] = np.matmul(by_row[:, ~few], light)
-        _add_columns(light, by_row, few, found)
-        if moment is not None:
-            _add_moment(moment.first, moment.number, moment.x, moment.value, by_row, rows.start or 0, found)
+            found[:, ~few] = np.matmul(watts[:, ~few], light)
+        if few.any():
+            _add_columns(light, watts, few, found)
+        return found
+
+    def at_moment(self, light: Float32, watts: Float32, rows: slice, moment: Moment | None) -> Float32:
+        """The light (rows of the slice, patterns, width) of `of_patterns` with that of drops and flakes at a moment."""
+        if moment is None:
+            return light
+        found = light.copy()
+        _add_moment((moment.first, moment.number, moment.x, moment.value), watts, rows.start, found)
         return found
 
     def of_spots(self, rows: Rows, columns: Rows, moment: Moment | None) -> Float32:
@@ -233,11 +241,9 @@ def _add_columns(light: Float32, watts: Float32, few: NDArray[np.bool_], found: 
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_moment(
-    first: NDArray[np.int64], number: NDArray[np.int64], at: NDArray[np.int32], value: Float32,
-    watts: Float32, first_row: int, found: Float32,
-) -> None:  # fmt: skip
+def _add_moment(moment: Sparse, watts: Float32, first_row: int, found: Float32) -> None:
     """Add the light of drops and flakes to found (rows, patterns, width), rows from first_row on."""
+    first, number, at, value = moment
     for y in range(len(found)):
         of_row = watts[min(y, len(watts) - 1)]
         for p in range(found.shape[1]):
@@ -274,7 +280,7 @@ def checked_columns(columns: int, command_range: tuple[float, float], limits: tu
     return first + (np.arange(columns) + 0.5) * (last - first) / columns
 
 
-def blocks(rows: int, patterns: int, width: int, most_bytes: int = 1 << 25) -> Iterator[slice]:
+def blocks(rows: int, patterns: int, width: int, most_bytes: int = 1 << 22) -> Iterator[slice]:
     """Slices of rows whose light in all patterns takes about `most_bytes`."""
     step = max(1, most_bytes // max(1, 4 * patterns * width))
     return (slice(first, min(first + step, rows)) for first in range(0, rows, step))
