@@ -78,7 +78,8 @@ class Axis:
         first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
         steps = (1, 2, 5) if math.log10(self.high / self.low) < _DECADES_WITH_STEPS else (1,)
         values = [step * 10.0**power for power in range(first, last + 1) for step in steps]
-        return [value for value in values if self.low <= value <= self.high]
+        shown = [value for value in values if self.low <= value <= self.high]
+        return shown if len(shown) > 1 else round_values(self.low, self.high, 4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ td, th {{ padding: 0.15em 1.1em 0.15em 0; text-align: left; vertical-align: top 
 tr + tr td {{ border-top: 1px solid #eef1f4 }}
 td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }}
 .side {{ display: flex; flex-wrap: wrap; gap: 4px 20px; align-items: flex-start }}
+.side > * {{ min-width: 0; max-width: 100% }}
 .pictures {{ display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 4px 20px }}
 figure {{ margin: 0.4em 0; min-width: 0; max-width: 640px }}
 figcaption, .small {{ color: #5f6d7b; font-size: 0.88em }}
@@ -47,10 +48,9 @@ pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 
 @media print {{
   body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3 {{ break-after: avoid }}
   figure, img, svg, tr, .good, .bad {{ break-inside: avoid }} .wide {{ overflow: visible }}
+  tr:first-child {{ break-after: avoid }}
   .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
-  .side figure {{ flex-basis: 45% }} .legend span {{ display: inline-block; margin-right: 1.4em }}
-.key {{ display: inline-block; vertical-align: -2px }}
-.side > svg {{ flex-basis: 30% }}
+  .side figure {{ flex-basis: 45% }} .side > svg {{ flex-basis: 30% }}
 }}
 """
 GENERATOR: Final = "spadrig"

@@ -113,12 +113,15 @@ def _pictures(runs: Sequence[RunFacts], most_px: int) -> str:
     def depth(run: RunFacts, at: str) -> str:
         if run.depth_m is None:
             return ""
-        return picture(depth_picture(_thinned(run.depth_m, most_px), limits), f"Depth, {at}; black: no depth.")
+        ends = "" if limits is None else f" from {limits[0]:.3g} m (bright) to {limits[1]:.3g} m (dark)"
+        return picture(depth_picture(_thinned(run.depth_m, most_px), limits), f"Depth, {at}{ends}; black: no depth.")
 
     def confidence(run: RunFacts, at: str) -> str:
         if run.confidence is None:
             return ""
-        return picture(confidence_picture(_thinned(run.confidence, most_px)), f"Confidence of each depth, {at}.")
+        return picture(
+            confidence_picture(_thinned(run.confidence, most_px)), f"Confidence of each depth, {at}; bright: sure."
+        )
 
     def counts(run: RunFacts, at: str) -> str:
         if run.counts is None:
@@ -131,7 +134,7 @@ def _pictures(runs: Sequence[RunFacts], most_px: int) -> str:
             return ""
         scale = Scale(_ERROR_M[1] * 1e3, _ERROR_M[0] * 1e3, "mm", "inferno", "unknown", log=True, steps=_COARSE)
         drawn = scale.picture(_thinned(np.abs(error_m), most_px) * np.float32(1e3))
-        return picture(drawn, f"Error of the depth, {at}; black: no depth or no truth.")
+        return picture(drawn, f"Error of the depth, {at}, from 1 mm (dark) to 1 m (bright); black: not known.")
 
     shown = []
     for what, kind in {"depth": depth, "confidence": confidence, "counts": counts, "error": error}.items():

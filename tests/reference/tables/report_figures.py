@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.report.charts import INK, Panel, Point, Series, chart_svg
+from rig.run_folder.pictures import depth_scale, png_bytes
 from rig.tradeoff.files import colour_of
 from tests.reference.adapter import reconstruct
 from tests.reference.scene import Scene
@@ -46,6 +47,8 @@ ROW = 250
 
 SIDE_PX = 246
 """Side of a depth map."""
+COLOURS = 32
+"""Different colours of a depth map: more would make a much larger file."""
 PLACE_PX = (SIDE_PX + 24, SIDE_PX + 50)
 """Width and height that it takes with its words."""
 
@@ -283,15 +286,14 @@ class DepthMap:
     def svg(self) -> str:
         """The map in a place of a chart, depth in words below it."""
         near, far = self.limits
-        level = np.clip(245 - 225 * (self.depth_m - near) / (far - near), 20, 245)
-        picture = cv2.applyColorMap(np.nan_to_num(level).astype(np.uint8), cv2.COLORMAP_TURBO)
-        picture[~np.isfinite(self.depth_m)] = 0
-        _, png = cv2.imencode(".png", cv2.resize(picture, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA))
+        scale = replace(depth_scale(self.limits), steps=COLOURS)
+        shown = cv2.resize(self.depth_m.astype(np.float32), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_NEAREST)
+        png = png_bytes(scale.colours(shown), small=True)
         return (
             f'<text x="16" y="18" font-weight="bold" fill="{INK}">{escape(self.title)}</text>'
             f'<image x="16" y="28" width="{SIDE_PX}" height="{SIDE_PX}" '
             f'href="data:image/png;base64,{b64encode(png).decode()}"/>'
-            f'<text x="16" y="{SIDE_PX + 41}" font-size="10" fill="{INK}">red {near:.1f} m, blue {far:.1f} m, '
+            f'<text x="16" y="{SIDE_PX + 41}" font-size="10" fill="{INK}">yellow {near:.1f} m, dark blue {far:.1f} m, '
             "black: no answer</text>"
         )
 

@@ -3,7 +3,7 @@
 import math
 import re
 
-from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
+from rig.report.charts import Axis, Panel, Series, chart_svg, legend, panel_svg
 
 POINTS = [(0.0, 1.0), (1.0, 2.0), (2.0, math.nan), (3.0, 1.0), (4.0, 2.0)]
 
@@ -31,3 +31,11 @@ def test_a_panel_alone_has_axes_and_its_name_and_no_legend():
     assert html.startswith('<p class="legend">')
     assert "curve" in html
     assert html.count("<svg") == 1
+
+
+def test_a_logarithmic_axis_has_two_labels_at_least():
+    """Also between two and five, where no power of ten nor half of one lies."""
+    for low, high in ((5.1, 8.3), (2.05, 4.9), (0.12, 0.13), (3.0, 30.0), (1e-3, 1e3), (7.0, 7.0)):
+        ticks = Axis.over([low, high], True, 0, 100).ticks()
+        assert len(ticks) >= 2
+        assert all(0 <= Axis.over([low, high], True, 0, 100).px(value) <= 100 for value in ticks)

@@ -216,8 +216,8 @@ def test_runs_of_different_cameras_are_not_subtracted(run: Path, tmp_path: Path)
 
 def test_another_map_than_the_last_one_can_be_shown(tmp_path: Path) -> None:
     run = made_run(tmp_path / "three", maps=3)
-    assert "Depth, map 2;" in report(run)
-    assert "Depth, map 1;" in report(run, number=1)
+    assert "Depth, map 2 from" in report(run)
+    assert "Depth, map 1 from" in report(run, number=1)
     with pytest.raises(UsageError, match=r"map 3 is not in .*three; it has 0 to 2$"):
         read_run(run, 3)
 
