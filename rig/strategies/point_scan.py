@@ -1,14 +1,16 @@
-"""Point scans: one spot at a time with all the light, the SPAD array looks at the row on which it lies.
+"""Point scans: one spot at a time, the SPAD array looks at the row on which it lies.
 
-Spots lie on a grid that is as fine as the time allows, on every row and column at best. A spot's time is at least one
-frame. The whole picture counts: if only some of its rows are measured, they get their share of the time. Rows without
-spots have the depths of the nearest row with spots.
+The spot is just bright enough for a surface to be seen in a frame, which a few spots of rising brightness show: more
+light would fill the row with fog, to a sensor that counts to one. Spots lie on a grid that is as fine as the time
+allows, on every row and column at best. A spot's time is at least one frame. The whole picture counts: if only some of
+its rows are measured, they get their share of the time. Rows without spots have the depths of the nearest row with
+spots.
 
-`first-bright` goes along the row from the far end and takes the first bright pixel: fog scatters light back on the near
-side of the surface, and nothing does behind it. A pixel is bright if its count is above what ambient light and dark
-counts make it, with one wrong pixel in a hundred rows. `likelihood` reads the same counts with the estimator of this
-name, which learns how much light fog and surface send back. A spot is so bright that single frames saturate around it;
-the estimator knows that a pixel cannot count more than one.
+`first-bright` goes along the row from the far end and takes the first bright spot: fog scatters light back on the near
+side of the surface, and nothing does behind it. Five pixels together are bright if their counts are above what ambient
+light and dark counts make of them, with one wrong place in a hundred rows; the brightest five from there on, as far as
+a spot is wide, are the answer. `likelihood` reads the same counts with the estimator of this name, which learns how
+much light fog and surface send back, and knows that a pixel cannot count more than one in a frame.
 """
 
 import math
@@ -32,9 +34,15 @@ from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
 COARSEST: Final = 16
 """Largest distance of spots, in rows and columns."""
 FALSE_ROWS: Final = 0.01
-"""Share of rows on which a pixel without the spot's light counts as bright."""
+"""Share of rows on which a place without the spot's light counts as bright."""
 WIDTH_PX: Final = 2
-"""Half of a spot's width: the answer lies this far inside the bright pixels, or in their middle if they are fewer."""
+"""Pixels of a spot on each side of its middle."""
+BRIGHTNESS: Final = tuple(4.0**-step for step in range(6, -1, -1))
+"""Shares of the power that are tried, the least first."""
+TRIED: Final = 20
+"""Spots with which each is tried."""
+LIT: Final = 0.021
+"""Share of a window's pixels that fire if spots are seen: three of 150."""
 SHRINK: Final = 4.0
 """A pixel's ambient rate is learned from its own frames and, as if it were so many, from all of the picture."""
 
@@ -49,13 +57,20 @@ class Grid:
 
 
 def grid_within(frames: int, shape: tuple[int, int]) -> Grid | None:
-    """The finest grid of spots on (rows, columns) for so many frames; None if it would be coarser than COARSEST."""
-    for step in range(1, COARSEST + 1):
-        rows, columns = (np.arange((n - 1) % step // 2, n, step) for n in shape)
-        spots = len(rows) * len(columns)
-        if spots <= frames:
-            return Grid(rows, columns, frames // spots)
-    return None
+    """The grid with most spots on (rows, columns) for so many frames; None if it would be coarser than COARSEST.
+
+    Distances of rows and of columns differ by one at most.
+    """
+    best: Grid | None = None
+    for down in range(1, COARSEST + 1):
+        for along in range(max(1, down - 1), min(COARSEST, down + 1) + 1):
+            rows, columns = (
+                np.arange((n - 1) % step // 2, n, step) for n, step in zip(shape, (down, along), strict=True)
+            )
+            spots = len(rows) * len(columns)
+            if spots <= frames and (best is None or spots > len(best.rows) * len(best.columns)):
+                best = Grid(rows, columns, frames // spots)
+    return best
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,15 +88,17 @@ class PointScan:
         """Measure once, see `Strategy`."""
         share = geometry.shape[0] / geometry.model.camera.height
         frames = math.floor(frames_within(budget, apparatus.spad_frame_s) * share)
-        grid = grid_within(frames, (geometry.shape[0], geometry.columns))
+        tried = (len(BRIGHTNESS) + 1) * TRIED
+        grid = grid_within(frames - tried, (geometry.shape[0], geometry.columns))
         if grid is None:
-            spots = geometry.shape[0] * geometry.columns / COARSEST**2
+            spots = geometry.shape[0] * geometry.columns / COARSEST**2 + tried
             raise TooShort(f"{self.name} needs {spots / share * apparatus.spad_frame_s * 1e3:.3g} ms")
+        brightness = choose_brightness(apparatus, geometry, np.random.default_rng(rng_seed))
         thinned = ColumnGeometry(
             geometry.model, geometry.commands[grid.columns], geometry.depth_range_m, geometry.rows[grid.rows]
         )
         sweep = thinned.sweep()
-        volume = _count(apparatus, sweep, grid)
+        volume = _count(apparatus, sweep, grid, brightness)
         if self.reads == "likelihood":
             settings = EstimateConfig(estimator="likelihood", min_confidence=MIN_CONFIDENCE)
             result = Reconstructor(geometry.model, thinned.commands, sweep, settings).map(volume)
@@ -92,12 +109,31 @@ class PointScan:
         return Answer(depth_m[nearest], confidence[nearest])
 
 
-def _count(apparatus: Apparatus, sweep: SweepGeometry, grid: Grid) -> CountVolume:
+def choose_brightness(apparatus: Apparatus, geometry: ColumnGeometry, rng: np.random.Generator) -> float:
+    """The least of BRIGHTNESS at which spots are seen: a few at random places, one frame each.
+
+    Judged are the pixels within the search windows, by the share that the spot makes fire of those that ambient light,
+    measured first, does not.
+    """
+    sweep = geometry.sweep()
+    x = np.arange(geometry.shape[1])
+    dark = apparatus.spad_counts(np.zeros((1, apparatus.columns), np.float32), np.array([TRIED]))[0] / TRIED
+    for brightness in BRIGHTNESS:
+        rows, columns = (rng.integers(0, n, TRIED) for n in (geometry.shape[0], geometry.columns))
+        seen = apparatus.spots(rows, columns, 1, brightness) > 0
+        inside = (x >= sweep.x_lo[rows, columns, None]) & (x <= sweep.x_hi[rows, columns, None])
+        ambient = dark[rows][inside].mean() if inside.any() else 1.0
+        if inside.any() and seen[inside].mean() - ambient >= LIT * (1 - ambient):
+            return brightness
+    return BRIGHTNESS[-1]
+
+
+def _count(apparatus: Apparatus, sweep: SweepGeometry, grid: Grid, brightness: float) -> CountVolume:
     """Counts of the rows of all spots, column after column."""
     dtype = np.uint8 if grid.frames <= 255 else np.uint16 if grid.frames <= 65535 else np.uint32
     counts = np.empty((len(grid.columns), len(grid.rows), sweep.window), dtype)
     for at, column in enumerate(grid.columns):
-        seen = apparatus.spots(grid.rows, np.full(len(grid.rows), column), grid.frames)
+        seen = apparatus.spots(grid.rows, np.full(len(grid.rows), column), grid.frames, brightness)
         counts[at] = windowed(seen[None], sweep, at)[0]
     columns = len(counts)
     return CountVolume(
@@ -108,38 +144,53 @@ def _count(apparatus: Apparatus, sweep: SweepGeometry, grid: Grid) -> CountVolum
 
 
 def first_bright(volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
-    """Stripe table: on every row the first bright pixel from the far end, or the middle of a narrow bright run.
+    """Stripe table: on every row the first bright spot from the far end.
 
-    Confidence: of a single pixel that is so bright by chance, by Bernoulli's law over the window, from its count.
+    Confidence: probability that ambient light has made no place of the row so bright, by Chernoff's bound.
     """
     ambient = ambient_rate(volume, geometry)
     columns, rows, window = volume.counts.shape
     table = StripeTable.empty(rows, columns)
-    k = volume.exposures
+    reach = 2 * WIDTH_PX + 1
+    order = slice(None, None, -1 if geometry.near_is_left else 1)  # from the far end to the near one
+    row = np.arange(rows)
     for column in range(columns):
         lo, hi = geometry.x_lo[:, column], geometry.x_hi[:, column]
         x = geometry.x0[column] + np.arange(window)
         at = np.minimum(x, volume.width - 1)
-        inside = (x >= lo[:, None]) & (x <= hi[:, None]) & ~geometry.defects[:, at]
-        counts = volume.counts[column].astype(np.int64)
-        chance = np.where(inside, tail(counts, k, ambient[:, at]), 1.0)
-        candidates = np.maximum(hi - lo + 1, 1)[:, None]
-        bright = chance * candidates < FALSE_ROWS
+        usable = ~geometry.defects[:, at] & (x < volume.width)
+        together = volume.exposures * _sums(usable.astype(np.float64), reach)
+        counts = _sums(np.where(usable, volume.counts[column], 0).astype(np.float64), reach)
+        rate = volume.exposures * _sums(np.where(usable, ambient[:, at], 0.0), reach) / np.maximum(together, 1.0)
+        inside = (x >= lo[:, None]) & (x <= hi[:, None]) & (together > 0)
+        chance = np.where(inside, tail(counts, np.maximum(together, 1.0), rate), 1.0)
+        candidates = np.maximum(hi - lo + 1, 1)
+        bright = (chance * candidates[:, None] < FALSE_ROWS)[:, order]
         found = bright.any(axis=1)
-        step = 1 if geometry.near_is_left else -1
-        order = slice(None, None, -step)  # from the far end to the near one
-        edge = bright[:, order].argmax(axis=1)
-        run = np.cumprod(np.take_along_axis(
-            bright[:, order], np.minimum(edge[:, None] + np.arange(2 * WIDTH_PX + 1), window - 1), axis=1
-        ), axis=1).sum(axis=1)  # fmt: skip
-        inward = edge + (run - 1) / 2
-        place = (window - 1 - inward) if step == 1 else inward
-        table.x_px[found, column] = (geometry.x0[column] + place)[found]
-        least = np.take_along_axis(chance[:, order], edge[:, None], axis=1)[:, 0]
-        table.confidence[found, column] = (1 - np.minimum(least * candidates[:, 0], 1.0))[found]
-        table.x_sd_px[found, column] = (np.maximum(run, 1) * 12**-0.5)[found]
+        # The brightest from the first one on; of several equally bright ones the middle one, since pixels saturate.
+        near = np.minimum(bright.argmax(axis=1)[:, None] + np.arange(reach), window - 1)
+        seen = np.where(np.take_along_axis(inside[:, order], near, axis=1),
+                        np.take_along_axis(counts[:, order], near, axis=1), -1.0)  # fmt: skip
+        top = seen == seen.max(axis=1, keepdims=True)
+        first = top.argmax(axis=1)
+        run = np.cumprod(np.where(np.arange(reach) < first[:, None], True, top), axis=1).sum(axis=1) - first
+        place = near[row, first] + np.minimum(run - 1, WIDTH_PX) / 2
+        best = np.take_along_axis(chance[:, order], near, axis=1)[row, first]
+        table.x_px[found, column] = (geometry.x0[column] + (window - 1 - place if geometry.near_is_left else place))[
+            found
+        ]
+        table.confidence[found, column] = (1 - np.minimum(best * candidates, 1.0))[found]
+        table.x_sd_px[found, column] = WIDTH_PX / 2
         table.signal[found, column] = table.haze[found, column] = 0.0
     return table
+
+
+def _sums(values: Float64, reach: int) -> Float64:
+    """Sums of `reach` neighbouring values along rows (rows, n), the same shape."""
+    padded = np.pad(values, ((0, 0), (reach // 2 + 1, reach // 2)))
+    total = np.cumsum(padded, axis=1)
+    result: Float64 = total[:, reach:] - total[:, :-reach]
+    return result
 
 
 def ambient_rate(volume: CountVolume, geometry: SweepGeometry) -> Float64:
@@ -148,7 +199,7 @@ def ambient_rate(volume: CountVolume, geometry: SweepGeometry) -> Float64:
     Pixels on the near side of a window have light from fog.
     """
     columns, rows, window = volume.counts.shape
-    ones, frames = np.zeros((2, rows, volume.width))
+    ones, frames = np.zeros((rows, volume.width)), np.zeros((rows, volume.width))
     for column in range(columns):
         x = geometry.x0[column] + np.arange(window)
         real = x < volume.width
@@ -159,28 +210,28 @@ def ambient_rate(volume: CountVolume, geometry: SweepGeometry) -> Float64:
         ones[:, x[real]] += np.where(outside, volume.counts[column][:, real], 0)
         frames[:, x[real]] += outside * float(volume.exposures)
     usual = (ones.sum() + 0.5) / (frames.sum() + 1.0)
-    return np.minimum((ones + SHRINK * usual) / (frames + SHRINK), 1 - 1e-9)
+    rate: Float64 = np.minimum((ones + SHRINK * usual) / (frames + SHRINK), 1 - 1e-9)
+    return rate
 
 
-def tail(counts: NDArray[np.int64], frames: int, rate: Float64) -> Float64:
-    """Probability of at least so many counts in so many frames at this rate per frame; Chernoff's bound from two on.
+def tail(counts: Float64, frames: Float64, rate: Float64) -> Float64:
+    """Chernoff's bound of the probability of at least so many counts in so many frames at a rate of 0 to 1 per frame.
 
-    One count: exact. The bound exp(-frames D(counts/frames || rate)) is 1 where the counts are below the mean.
+    exp(-frames D(counts/frames || rate)) with D the relative entropy; 1 where the counts are not above the mean.
     """
-    share = counts / frames
+    share = np.minimum(counts / frames, 1.0)
+    rate = np.clip(rate, 1e-12, 1 - 1e-12)
     with np.errstate(divide="ignore", invalid="ignore"):
         ones = np.where(share > 0, share * np.log(share / rate), 0.0)
         zeros = np.where(share < 1, (1 - share) * np.log((1 - share) / (1 - rate)), 0.0)
-    bound = np.exp(-frames * np.maximum(ones + zeros, 0.0))
-    once = -np.expm1(frames * np.log1p(-rate))
-    result: Float64 = np.where(share <= rate, 1.0, np.where(counts <= 1, np.where(counts == 1, once, 1.0), bound))
-    return result
+    bound: Float64 = np.where(share <= rate, 1.0, np.exp(-frames * np.maximum(ones + zeros, 0.0)))
+    return bound
 
 
 FIRST_BRIGHT = PointScan(
     "point-first-bright",
     "first-bright",
-    "SPAD array and a single spot of light, found as the first bright pixel from the far end of its row.",
+    "SPAD array and a single spot of light, found as the first bright place from the far end of its row.",
     "the report that this project follows; the idea: light behind a surface comes from ambient light alone",
     1.5,
 )

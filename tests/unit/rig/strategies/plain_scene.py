@@ -121,10 +121,12 @@ class PlainScene:
         read = self._rng.normal(0, 2.0, electrons.shape)
         return np.clip(np.rint(electrons / 3 + 20 + read), 0, self.camera_full_scale).astype(np.uint16)
 
-    def spots(self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int) -> NDArray[np.uint32]:
+    def spots(
+        self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int, brightness: float = 1.0
+    ) -> NDArray[np.uint32]:
         taken_s = len(rows) * frames * self.spad_frame_s
-        self._spent = Spent(self._spent.time_s + taken_s, self._spent.energy_j + taken_s * self.power_w)
-        brighter = self.geometry.shape[0]
+        self._spent = Spent(self._spent.time_s + taken_s, self._spent.energy_j + taken_s * brightness * self.power_w)
+        brighter = brightness * self.geometry.shape[0]
         flux = brighter * self.light[columns, rows] + self.ambient_per_s
         return self._rng.binomial(frames, -np.expm1(-flux * self.spad_frame_s)).astype(np.uint32)
 
