@@ -1,0 +1,330 @@
+"""Error-correcting codes over time with a binary projector and a SPAD. Simulation for comparison only.
+
+Single-Photon Structured Light (V. Sundar, S. Ma, A. C. Sankaranarayanan, M. Gupta, CVPR 2022) shows many short binary
+patterns, and protects the column's code against missed photons and ambient light. Pattern design of this kind is the
+subject of the patent application US 2023/0410333; this is written from the idea alone, to compare ways to measure depth
+in simulation, and drives no projector.
+
+Each column has a code word: its Gray code many times over, with the inverse (`repetition`); a word of a BCH code (R. C.
+Bose, D. K. Ray-Chaudhuri 1960, A. Hocquenghem 1959); or, `hybrid`, a BCH word for its block of columns, and stripes as
+wide as a block that move by a column at a time for its place in there: these patterns are coarse, and a blurred
+projector shows them with full contrast. All words light a pixel about half of the time. So a bit is read as one where a
+pixel fired more often than on average, and no word has an advantage because it is darker.
+
+A decoder takes the word that differs in the fewest bits, or the likeliest one. The likelihood knows counts only: let a
+word say that n1 frames were lit, in which k1 photons came, and n0 were dark with k0. Whatever the probabilities p1 > p0
+of a photon in a lit and in a dark frame, all being equally likely,
+
+    L = integral p1^k1 (1 - p1)^(n1 - k1) dp1  integral p0^k0 (1 - p0)^(n0 - k0) dp0
+      = k1! (n1 - k1)! / (n1 + 1)!  k0! (n0 - k0)! / (n0 + 1)!
+"""
+
+import logging
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simd import Float64, Uint8
+from rig.strategies.apparatus import Apparatus, Budget
+from rig.strategies.patterns.binary_codes import QUANTISED_SD, bits_for, gray_code
+from rig.strategies.patterns.levels import (
+    answer_of,
+    columns_at_infinity,
+    peak_offset,
+    spad_frames,
+    window_columns,
+)
+from rig.strategies.patterns.posterior import Window
+from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
+
+Int64 = NDArray[np.int64]
+
+_log = logging.getLogger(__name__)
+
+NOTICE: Final = "simulation for comparison only: such patterns are subject of US 2023/0410333"
+PRIMITIVE: Final = {4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001, 8: 0b100011101}
+"""Primitive polynomial of the field with 2^m elements by m (S. Lin, D. J. Costello, "Error Control Coding", app. A)."""
+CODES: Final = {31: 11, 63: 10, 127: 15, 255: 13}
+"""Message bits of BCH codes by length, with words enough for a projector; they correct 5, 13, 27 and 59 errors."""
+MOST_REPEATED: Final = 13
+"""Repetitions of a Gray code; thirteen are as long as BCH(255, 13) with pattern and inverse of 10 bits."""
+BLOCK: Final = 8
+"""Columns of a block and of a stripe of `hybrid`."""
+LONGEST_HYBRID: Final = 127
+Words = Literal["repetition", "bch", "hybrid"]
+
+
+def generator(length: int, message_bits: int) -> int:
+    """Generator polynomial over GF(2), bit i for x^i, of the narrow-sense binary BCH code with words of 2^m - 1 bits.
+
+    It has the roots alpha, alpha^2, ... until length - message_bits of them are used up. Raises ValueError if the code
+    does not exist.
+    """
+    m = length.bit_length()
+    if length != 2**m - 1 or m not in PRIMITIVE:
+        raise ValueError(
+            f"BCH code words have {sorted(2**m - 1 for m in PRIMITIVE)} bits, not {length}; give one of them"
+        )
+    power = [1]
+    for _ in range(length - 1):
+        doubled = power[-1] << 1
+        power.append(doubled ^ PRIMITIVE[m] if doubled >> m else doubled)
+    log = {value: exponent for exponent, value in enumerate(power)}
+    result, used = 1, set[int]()
+    for root in range(1, length):
+        if result.bit_length() - 1 == length - message_bits:
+            return result
+        if root in used:
+            continue
+        conjugates = {root * 2**i % length for i in range(m)}
+        used |= conjugates
+        minimal = [1]  # coefficients in the field, lowest first
+        for exponent in conjugates:
+            scaled = [power[(log[c] + exponent) % length] if c else 0 for c in minimal]
+            minimal = [a ^ b for a, b in zip([0, *minimal], [*scaled, 0], strict=True)]
+        factor = sum(c << i for i, c in enumerate(minimal))
+        result = _product(result, factor)
+    raise ValueError(f"there is no BCH code of {length} bits with {message_bits} message bits; see `CODES` for some")
+
+
+def _product(a: int, b: int) -> int:
+    result = 0
+    while b:
+        result ^= a if b & 1 else 0
+        a, b = a << 1, b >> 1
+    return result
+
+
+def bch_words(length: int, message_bits: int, messages: NDArray[np.int64]) -> Uint8:
+    """Code words (messages, length) of messages 0 to 2^message_bits - 1: the message, most significant bit first, then
+    its parity bits."""
+    divisor, parity = generator(length, message_bits), length - message_bits
+    rows = []
+    for bit in range(message_bits):
+        rest = 1 << (parity + bit)
+        while rest.bit_length() > parity:
+            rest ^= divisor << (rest.bit_length() - 1 - parity)
+        rows.append([(rest >> i) & 1 for i in range(parity - 1, -1, -1)])
+    bits = (messages[:, None] >> np.arange(message_bits - 1, -1, -1)) & 1
+    checks = bits @ np.array(rows[::-1], np.int64).reshape(message_bits, parity) % 2
+    return np.concatenate([bits, checks], axis=1).astype(np.uint8)
+
+
+def correctable(length: int, message_bits: int) -> int:
+    """Errors in a word that bounded decoding corrects: below half of the bits in which the nearest two words differ."""
+    lightest = bch_words(length, message_bits, np.arange(1, 2**message_bits)).sum(axis=1, dtype=np.int64).min()
+    return int(lightest - 1) // 2
+
+
+@lru_cache(maxsize=16)
+def _balanced_words(length: int, numbers: int) -> Uint8:
+    """So many words (numbers, length) of a BCH code, those that light nearest to half of the time, in random order.
+
+    The sum of three words is a word. Where light of neighbouring columns mixes, what is read resembles that sum; if few
+    words of many are in use, it is hardly ever one of them.
+    """
+    words = bch_words(length, CODES[length], np.arange(2 ** CODES[length]))
+    words = np.random.default_rng(length).permutation(words)
+    uneven = np.abs(2 * words.sum(axis=1, dtype=np.int64) - length)
+    return words[np.argsort(uneven, kind="stable")[:numbers]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CodeBook:
+    """Code words (numbers, patterns), uint8, of columns; they repeat. fine: patterns in which the place between two
+    columns shows, as all neighbours differ there in the same way."""
+
+    words: Uint8
+    fine: slice
+
+
+def code_book(kind: Words, numbers: int, frames: int) -> CodeBook:
+    """Code book for at least so many columns, after which it repeats, with at most so many patterns as frames.
+
+    Raises `TooShort` if even the shortest has more.
+    """
+    if kind == "bch":
+        lengths = [length for length, bits in CODES.items() if 2**bits - 2 >= numbers]
+        length = max((n for n in lengths if n <= frames), default=0)
+        return CodeBook(_balanced_words(_enough(kind, length, lengths[0], frames), numbers), slice(None))
+    if kind == "repetition":
+        bits = bits_for(numbers)
+        gray = gray_code(bits, 2**bits).T
+        pairs = np.stack([gray, 1 - gray], axis=2).reshape(len(gray), -1)
+        times = min(MOST_REPEATED, frames // pairs.shape[1])
+        return CodeBook(np.tile(pairs, (1, _enough(kind, times, pairs.shape[1], frames))), slice(None))
+    blocks = 2 * -(-numbers // (2 * BLOCK))
+    lengths = [n for n, bits in CODES.items() if 2**bits - 2 >= blocks and n <= LONGEST_HYBRID]
+    length = max((n for n in lengths if _stripes(n) + n <= frames), default=0)
+    length = _enough(kind, length, lengths[0] + _stripes(lengths[0]), frames)
+    coarse = np.repeat(_balanced_words(length, blocks), BLOCK, axis=0)
+    shift = (np.arange(blocks * BLOCK)[:, None] + np.arange(2 * BLOCK)) % (2 * BLOCK)
+    stripes = np.tile((shift < BLOCK).astype(np.uint8), (1, _stripes(length) // shift.shape[1]))
+    return CodeBook(np.concatenate([coarse, stripes], axis=1), slice(length, None))
+
+
+def _stripes(length: int) -> int:
+    """Patterns with stripes beside a BCH word of this length: whole periods of about as many."""
+    return 2 * BLOCK * -(-length // (2 * BLOCK))
+
+
+def _enough(kind: str, found: int, least: int, frames: int) -> int:
+    if not found:
+        raise TooShort(f"the shortest {kind} code takes {least} frames, the budget has {frames}")
+    return found
+
+
+def packed(bits: NDArray[np.generic]) -> NDArray[np.uint64]:
+    """Bits (..., n) as words of 64 (..., ceil(n / 64)), padded with zeros."""
+    padding = [(0, 0)] * (bits.ndim - 1) + [(0, -bits.shape[-1] % 64)]
+    whole = np.packbits(np.pad(bits, padding).astype(np.uint8), axis=-1)
+    return np.ascontiguousarray(whole).view(np.uint64)
+
+
+def differing_bits(received: NDArray[np.uint64], words: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Number of bits (pixels, words) in which received ones (pixels, n) differ from code words (words, n), packed."""
+    result = np.zeros((len(received), len(words)), np.int64)
+    for part in range(received.shape[1]):
+        result += np.bitwise_count(received[:, None, part] ^ words[None, :, part])
+    return result
+
+
+def log_factorials(most: int) -> Float64:
+    """ln n! for n = 0 to most."""
+    return np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, most + 1, dtype=np.float64)))])
+
+
+def log_evidence(counts: Int64, lit_frames: Int64, frames: int, total: Int64, table: Float64) -> Float64:
+    """The logarithm of L of the module's docstring, float64 like counts; -inf where lit frames fire more rarely.
+
+    counts: k1. lit_frames: n1. frames: n1 + n0. total: k1 + k0. The last three broadcast. table: `log_factorials` up to
+    frames + 1.
+    """
+    k1, n1 = counts, np.broadcast_to(lit_frames, counts.shape)
+    k0, n0 = total - k1, frames - n1
+    value = table[k1] + table[n1 - k1] - table[n1 + 1] + table[k0] + table[n0 - k0] - table[n0 + 1]
+    return np.where(k1 * n0 >= k0 * n1, value, -np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoder:
+    """Finds columns by their words. frames: of the SPAD for each pattern."""
+
+    book: CodeBook
+    frames: int
+
+    def nearest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
+        """Columns (width,) whose words differ in the fewest bits from what one row's pixels saw, the standard deviation
+        of the column, and the probability that it is right. counts: (width, patterns).
+
+        Bits are taken to be read wrong as often as they differ from the word that is chosen.
+        """
+        words, patterns = self.book.words, self.book.words.shape[1]
+        bits = counts.astype(np.int64) * patterns > counts.sum(axis=1, dtype=np.int64, keepdims=True)
+        differ = window.of(differing_bits(packed(bits), packed(words)))
+        place = window.best(-differ)
+        wrong = (differ[np.arange(len(place)), place] + 0.5) / (patterns + 1.0)
+        log_odds = np.log1p(-np.minimum(wrong, 0.5)) - np.log(np.minimum(wrong, 0.5))
+        right = window.right(-differ * log_odds[:, None], place)
+        return window.column(place), np.full(len(place), QUANTISED_SD), right
+
+    def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
+        """The same for the likeliest words. Between two columns the share of their light tells how far."""
+        words, frames = self.book.words, self.frames
+        patterns, lit = words.shape[1], words.sum(axis=1, dtype=np.int64)
+        total = counts.sum(axis=1, dtype=np.int64)[:, None]
+        table = log_factorials(frames * patterns + 1)
+        in_lit = _in_lit(counts, words)
+        evidence = log_evidence(in_lit, lit * frames, frames * patterns, total, table)
+        seen = window.of(evidence)
+        place = window.best(seen)
+        number = np.mod(window.columns[np.arange(len(place)), place], len(words))
+        excess = _excess(counts, words[number], frames)
+        right = window.right(seen / excess[:, None], place)
+        offset, sd = self._between(counts, window, place, number)
+        return window.column(place) + offset, np.minimum(sd * np.sqrt(excess), QUANTISED_SD), right
+
+    def _between(
+        self, counts: NDArray[np.uint32], window: Window, place: Int64, number: Int64
+    ) -> tuple[Float64, Float64]:
+        """How far (width,) the light of the fine patterns lies from the column, -1/2 to 1/2, and its uncertainty."""
+        words, counts = self.book.words[:, self.book.fine], counts[:, self.book.fine]
+        mean = counts.mean(axis=1, dtype=np.float64)
+        light = window.of(_in_lit(counts, words) - mean[:, None] * words.sum(axis=1, dtype=np.int64))
+        before, at, after = window.around(light, place)
+        fall = at - np.minimum(before, after)
+        rivals = np.count_nonzero(np.roll(words, 1, axis=0) != np.roll(words, -1, axis=0), axis=1)[number]
+        noise = np.sqrt(rivals * (mean + 1.0 / words.shape[1]))
+        sd = np.where(fall > 0, 0.5 * noise / np.where(fall > 0, fall, 1.0), QUANTISED_SD)
+        return peak_offset(before, at, after), sd
+
+
+def _in_lit(counts: NDArray[np.uint32], words: Uint8) -> Int64:
+    """Counts (width, numbers) in the patterns that each word lights. Whole numbers below 2^24 are exact in float32."""
+    return np.rint(counts.astype(np.float32) @ words.T.astype(np.float32)).astype(np.int64)
+
+
+def _excess(counts: NDArray[np.uint32], words: Uint8, frames: int) -> Float64:
+    """Pearson's chi-square per degree of freedom, at least 1, of one row's counts (width, patterns) around the two
+    levels that the pixels' words (width, patterns) tell."""
+    lit = words.astype(np.float64)
+    dark = 1.0 - lit
+    excess = np.zeros(len(counts))
+    for group in (lit, dark):
+        size = np.maximum(group.sum(axis=1), 1.0)
+        mean = (group * counts).sum(axis=1) / size
+        variance = mean * (1.0 - mean / frames)
+        squares = (group * (counts - mean[:, None]) ** 2).sum(axis=1)
+        excess += np.where(variance > 0, squares / np.where(variance > 0, variance, 1.0), 0.0)
+    result: Float64 = np.maximum(excess / max(words.shape[1] - 2, 1), 1.0)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorCode:
+    """A code with a SPAD. likelihood: take the likeliest word instead of the nearest one."""
+
+    name: str
+    sentence: str
+    words: Words
+    likelihood: bool = False
+    source: str = "V. Sundar, S. Ma, A. C. Sankaranarayanan, M. Gupta, Single-photon structured light, CVPR 2022"
+    light: Light = "pattern"
+    clear_px: float = 1.0
+
+    def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
+        """Measure once. Nothing is random here."""
+        _log.info("%s: %s", self.name, NOTICE)
+        frames = int(spad_frames(apparatus, budget, [1.0])[0])
+        book = code_book(self.words, window_columns(geometry), frames)
+        patterns = book.words[np.arange(geometry.columns) % len(book.words)].T.astype(np.float32)
+        each = spad_frames(apparatus, budget, [1.0] * len(patterns))
+        counts = apparatus.spad_counts(patterns, each)
+        decoder = Decoder(book, int(each[0]))
+        decode = decoder.likeliest if self.likelihood else decoder.nearest
+        infinite = columns_at_infinity(geometry)
+        column, sd, right = (np.full(geometry.shape, np.nan) for _ in range(3))
+        for row in range(len(geometry.rows)):
+            column[row], sd[row], right[row] = decode(counts[:, row].T, Window(geometry, row, infinite))
+        return answer_of(geometry, column, sd, right)
+
+
+def _coded(words: Words, likelihood: bool) -> ErrorCode:
+    what = {
+        "repetition": "Gray code with inverse, repeated",
+        "bch": "BCH code of the column",
+        "hybrid": "BCH code of blocks of columns with shifted stripes",
+    }[words]
+    how = "the likeliest word from counts" if likelihood else "the word that differs in the fewest bits"
+    sentence = f"{what}, seen by a SPAD; {how} ({NOTICE})."
+    return ErrorCode(words + ("-likelihood" if likelihood else ""), sentence, words, likelihood)
+
+
+REPETITION = _coded("repetition", False)
+BCH = _coded("bch", False)
+BCH_LIKELIHOOD = _coded("bch", True)
+HYBRID = _coded("hybrid", False)
+HYBRID_LIKELIHOOD = _coded("hybrid", True)
