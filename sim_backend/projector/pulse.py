@@ -37,6 +37,8 @@ FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 GATE_SIGMAS = 4.0
 """Standard deviations of the blur by which the gate is wider than the depth range."""
 MOST_BYTES = 1 << 31
+PART_M = 0.1
+"""Length of the parts of a bin over which the medium's light is summed."""
 LEAST_RANGE_M = 1e-3
 """Distance from which on the medium sends light back; keeps 1/r^2 finite."""
 
@@ -147,7 +149,9 @@ def expected(
     """Write into mean (bins,) the detections that a pulse makes on average in each bin, if none blinds the pixel."""
     start_s, bin_s, sigma_s = times
     per_s = 0.5 * LIGHT_M_PER_S
-    sigma_m, step_m = per_s * sigma_s, per_s * bin_s
+    sigma_m = per_s * sigma_s
+    parts = max(1, math.ceil(per_s * bin_s / PART_M))
+    step_m = per_s * bin_s / parts
     below = edge((per_s * start_s - range_m) / sigma_m)
     lit_below = edge_sum((range_m - per_s * start_s) / sigma_m)
     for i in range(len(mean)):
@@ -157,13 +161,17 @@ def expected(
         mean[i] = surface * (above - below) + steady_per_s * bin_s
         below = above
         if medium > 0.0:
-            # Share of the bin that lies before the surface, whose edge is blurred.
-            lit_above = edge_sum((range_m - far_m) / sigma_m)
-            share = min(sigma_m * (lit_below - lit_above) / step_m, 1.0) if math.isfinite(lit_above) else 1.0
-            lit_below = lit_above
-            a, b = max(near_m, LEAST_RANGE_M), max(far_m, LEAST_RANGE_M)
-            # The integral of 1/r^2, and the extinction where half of it has come in.
-            mean[i] += share * medium * (b - a) / (a * b) * math.exp(-2.0 * extinction_per_m * math.sqrt(a * b))
+            for part in range(parts):
+                a = near_m + part * step_m
+                b = a + step_m
+                # Share of the part that lies before the surface, whose edge is blurred.
+                lit_above = edge_sum((range_m - b) / sigma_m)
+                share = min(sigma_m * (lit_below - lit_above) / step_m, 1.0) if math.isfinite(lit_above) else 1.0
+                lit_below = lit_above
+                a, b = max(a, LEAST_RANGE_M), max(b, LEAST_RANGE_M)
+                # The integral of 1/r^2, and the extinction where half of it has come in.
+                fog = medium * (b - a) / (a * b) * math.exp(-2.0 * extinction_per_m * math.sqrt(a * b))
+                mean[i] += share * fog
 
 
 @numba.njit(cache=True, nogil=True)

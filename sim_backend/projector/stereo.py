@@ -1,26 +1,27 @@
 """The scene from a second camera that stands where the light leaves the mirror, and what both cameras see of it.
 
-The second camera has the rays of the first, so it sees a point X in the direction X - S from the source S. The world
-has one depth per pixel of the first camera. A column of the second camera is, row by row, a plane of rays; it is traced
-to the surfaces like a sheet of light from S, which finds the first surface on every ray. Rows are taken as rectified: a
-point is in the same row of both pictures, even if the source stands higher or nearer than the camera. Rays that meet
-a place hidden from the first camera see what is next to it, of both sides the farther one.
+The second camera has the rays of the first, so it sees a point X in the direction X - S from the source S. The world has
+one depth per pixel of the first camera, and a tangent plane (facet). The strip of this plane that a pixel covers in its
+row goes to an interval of the second picture; of all strips there the nearest is seen, with the albedo at the very place.
+Rows are taken as rectified: a point is in the same row of both pictures, even if the source stands higher or nearer
+than the camera. Pixels to which nothing goes see places that are hidden from the first camera, and get what is next to
+them, of both sides the farther one. On a plane, places are right to 0.01 px. Cost: 40 ms for 512 x 512 pixels.
 
 In ambient light alone a surface of albedo rho at the distance r has the radiance rho/pi E exp(-sigma r), and the air in
-front of it adds airlight, as in `sim_backend.effects.ambient`. Cost: 40 ms for 512 columns and rows.
+front of it adds airlight, as in `sim_backend.effects.ambient`.
 """
 
 import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.light.optics import ambient_irradiance
-from sim_backend.light.sheet import empty_sheet
+from sim_backend.light.sheet import DEPTH_JUMP
 from sim_backend.light.view import CameraView
-from sim_backend.projector.transport import runs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,43 +41,80 @@ def first_view(view: CameraView, rows: NDArray[np.int64]) -> Seen:
 
 def second_view(view: CameraView, rows: NDArray[np.int64]) -> Seen:
     """What the second camera sees in these rows."""
-    inverse, albedo = (np.full((len(rows), view.width), np.nan) for _ in range(2))
-    range_m = np.full_like(inverse, np.inf)
-    source = view.source_m
-    for column in range(view.width):
-        u = np.nan_to_num(view.u[:, column])
-        normal = np.stack([np.ones_like(u), np.zeros_like(u), -u], axis=-1) / np.hypot(1, u)[:, None]
-        sheet = empty_sheet(np.column_stack([normal, normal @ source]), view.rows)
-        for first, last in runs(rows):
-            view.trace(sheet, first, last)
-        hit = np.flatnonzero(np.isfinite(sheet.x_stripe_px[rows]))
-        at, x = rows[hit], sheet.x_stripe_px[rows[hit]]
-        left = np.clip(np.floor(x).astype(np.int64), 0, view.width - 2)
-        share = x - left
-        ray_u, ray_v, albedo[hit, column] = (
-            (1 - share) * part[at, left] + share * part[at, left + 1] for part in (view.u, view.v, view.albedo)
-        )
-        inverse[hit, column] = np.sum(sheet.inverse[at] * np.stack([ray_u, ray_v, np.ones_like(x)], axis=-1), axis=-1)
-        points = np.stack([ray_u, ray_v, np.ones_like(x)], axis=-1) / inverse[hit, column, None]
-        range_m[hit, column] = np.linalg.norm(points - source, axis=-1)
+    u, v, surface, albedo = view.u[rows], view.v[rows], view.surface[rows], view.albedo[rows]
+    source_x, _, source_z = view.source_m
+    ends = []
+    for side in (-0.5, 0.5):
+        ray = np.stack([u + side * view.u_x[rows], v + side * view.v_x[rows], np.ones_like(u)], axis=-1)
+        inverse = np.sum(view.facet[rows] * ray, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ahead = 1 - inverse * source_z
+            tangent = (ray[..., 0] - inverse * source_x) / ahead
+            ends.append((tangent, np.where((surface > 0) & (ahead > 0), inverse / ahead, np.nan)))
+    places = np.full((2, *u.shape), np.nan)
+    for side, (tangent, _) in enumerate(ends):
+        for y in range(len(rows)):
+            places[side, y] = _columns(u[y], tangent[y])
+    inverse, found = np.zeros_like(u), np.zeros_like(u)
+    _project(places[0], places[1], ends[0][1], ends[1][1], surface, albedo, inverse, found)
     for y in range(len(rows)):
-        _fill(inverse[y], albedo[y], range_m[y])
-    return Seen(np.nan_to_num(albedo), range_m)
+        _fill(inverse[y], found[y])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        range_m = np.sqrt(u * u + v * v + 1) / inverse
+    return Seen(found, np.where(np.isnan(range_m), np.inf, range_m))
 
 
-def _fill(inverse: Array, albedo: Array, range_m: Array) -> None:
-    """Give pixels (width,) of a row that met no surface what the nearest pixel that did has, of both sides the farther
-    one. A row that met none stays open sky."""
-    known = np.flatnonzero(np.isfinite(inverse))
+def _columns(u: Array, tangent: Array) -> Array:
+    """Fractional pixels (width,) of a row with tangents u (width,) in which rays of these tangents (width,) are seen."""
+    known = np.flatnonzero(np.isfinite(u))
+    if len(known) < 2:
+        return np.full_like(tangent, np.nan)
+    # Half a pixel more at both ends, linearly.
+    at = np.concatenate([[known[0] - 1.0], known, [known[-1] + 1.0]])
+    rays = np.concatenate([[2 * u[known[0]] - u[known[1]]], u[known], [2 * u[known[-1]] - u[known[-2]]]])
+    result: Array = np.interp(tangent, rays, at, left=-np.inf, right=np.inf)
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(
+    low: Array, high: Array, inverse_low: Array, inverse_high: Array, surface: Array, albedo: Array, inverse: Array,
+    found: Array,
+) -> None:  # fmt: skip
+    """Write the inverse depth and the albedo of the second picture (rows, width), 0 where nothing goes to.
+
+    low, high: places in the second picture of both ends of each pixel's strip, with their inverse depths there.
+    """
+    rows, width = surface.shape
+    for y in range(rows):
+        for x in range(width):
+            a, b = low[y, x], high[y, x]
+            if not (-np.inf < a < b < np.inf and inverse_low[y, x] > 0.0 and inverse_high[y, x] > 0.0):
+                continue  # beside the picture, or seen from behind
+            for column in range(max(math.ceil(a), 0), min(math.floor(b), width - 1) + 1):
+                share = (column - a) / (b - a)
+                near = inverse_low[y, x] + share * (inverse_high[y, x] - inverse_low[y, x])
+                if near > inverse[y, column]:
+                    inverse[y, column] = near
+                    beside = x - 1 if share < 0.5 else x + 1
+                    found[y, column] = albedo[y, x]
+                    if 0 <= beside < width:
+                        step = abs(surface[y, beside] - surface[y, x])
+                        if step <= DEPTH_JUMP * max(surface[y, beside], surface[y, x]):
+                            found[y, column] += abs(share - 0.5) * (albedo[y, beside] - albedo[y, x])
+
+
+def _fill(inverse: Array, albedo: Array) -> None:
+    """Give pixels (width,) of a row to which nothing goes (0) the nearest known one's values, of both sides the farther
+    one's. A row without any known pixel stays open sky."""
+    known = np.flatnonzero(inverse > 0)
     if not len(known):
         return
-    here = np.arange(len(inverse))
-    place = np.searchsorted(known, here, side="right")
-    left, right = known[np.clip(place - 1, 0, None)], known[np.clip(place, None, len(known) - 1)]
+    place = np.searchsorted(known, np.arange(len(inverse)), side="right")
+    left, right = known[np.maximum(place - 1, 0)], known[np.minimum(place, len(known) - 1)]
     taken = np.where(inverse[left] <= inverse[right], left, right)
-    taken = np.where(place == 0, right, np.where(place == len(known), left, taken))
-    empty = ~np.isfinite(inverse)
-    albedo[empty], range_m[empty] = albedo[taken[empty]], range_m[taken[empty]]
+    empty = inverse == 0
+    albedo[empty], inverse[empty] = albedo[taken[empty]], inverse[taken[empty]]
 
 
 def ambient_radiance(setting: Setting, seen: Seen, filter_width_m: float) -> Array:
