@@ -162,6 +162,27 @@ def best_match(left: Float32, evidence: Float32, independent: float, at: NDArray
     )  # fmt: skip
 
 
+def doubtful_at_edges(matches: Matches, step_px: float) -> Matches:
+    """The matches with less confidence where a block lies over a depth edge.
+
+    A block that shows two surfaces matches the one with more contrast, and its middle may lie on the other. So where
+    confident answers within a block are more than `EDGE_PX` apart, either surface has even odds. step_px: pixels of
+    disparity between two hypotheses.
+    """
+    sure = matches.confidence >= 0.5
+    rows, width = (min(size, 2 * extent - 1) for size, extent in zip(BLOCK_PX, sure.shape, strict=True))
+    block = np.ones((rows, width), np.uint8)
+    low, high = (np.where(sure, matches.place, nowhere).astype(np.float32) for nowhere in (NOWHERE, -NOWHERE))
+    edge = step_px * (cv2.dilate(high, block) - cv2.erode(low, block)) > EDGE_PX
+    return matches._replace(confidence=np.where(edge, 0.5 * matches.confidence, matches.confidence).astype(np.float32))
+
+
+NOWHERE: Final = 1e9
+"""Stands for a place farther than any hypothesis."""
+EDGE_PX: Final = 4.0
+"""Difference of disparities within a block that is no slope: a surface with a third of a pixel per pixel has less."""
+
+
 def _lagged(flat: Float32, down: int, right: int) -> float:
     """Autocorrelation of a picture of mean 0 and variance 1 at a lag."""
     rows, width = flat.shape

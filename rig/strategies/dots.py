@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
+from rig.strategies.block_matching import bands, best_match, doubtful_at_edges, exposed, independent_values, match
 from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
@@ -91,6 +91,7 @@ def depth_of_dots(picture: Float32, shown: Float32, geometry: ColumnGeometry) ->
         known = list(_references(fine[rows], columns[:, rows], (inverse - low) / (high - low) * (NODES - 1)))
         independent = independent_values(picture[rows], known[number // 2][0])
         found = best_match(*match(picture[rows], iter(known), independent), independent)
+        found = doubtful_at_edges(found, STEP_PX)
         step = inverse[1] - inverse[0]
         at = np.interp(found.place, np.arange(number), inverse)
         sure = found.confidence * within(RIGHT * at, step * found.sd.astype(np.float64))

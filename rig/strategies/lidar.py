@@ -40,6 +40,8 @@ NEIGHBOURS: Final = 8
 """Pixels to either side whose first photons say whether a pixel's own came from a surface."""
 NEAR_SIGMAS, AROUND_SIGMAS = 3.0, 15.0
 """Photons of one surface differ by sqrt(2) standard deviations of the pulse; light of fog is spread over many."""
+CHANCE: Final = NEAR_SIGMAS / (AROUND_SIGMAS - NEAR_SIGMAS)
+"""Photons that come with another by chance, over those around it."""
 
 Method = Literal["first-photon", "peak", "gamma"]
 
@@ -85,8 +87,9 @@ def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) ->
 
     Pulses are alike, so each of a pixel's photons was the first one with the same probability; it is drawn. Whether it
     came from a surface is judged by the first photons of up to `NEIGHBOURS` pixels to either side in the row: those
-    that come with it (within 3 standard deviations of the pulse) against those shortly before and behind, which would
-    come with it by chance. The share of photons that come from surfaces is estimated over the whole picture.
+    that come with it (within 3 standard deviations of the pulse) against those shortly before and behind, which tell
+    how many come with it by chance. The share of photons that come from surfaces is estimated over the whole picture,
+    from neighbours that come together.
     """
     total = seen.counts.sum(axis=-1, dtype=np.int64)
     drawn = rng.integers(0, np.maximum(total, 1))
@@ -95,20 +98,23 @@ def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) ->
     )
     time_s = np.where(total > 0, seen.start_s + seen.bin_s * (at + 0.5), np.nan)
     with_it, around, others = (np.zeros(time_s.shape) for _ in range(3))
+    next_to_it = np.zeros(2)
     width = time_s.shape[1]
     for offset in range(1, min(NEIGHBOURS, width - 1) + 1):
         apart = np.abs(time_s[:, offset:] - time_s[:, :-offset])
+        near, far = apart < NEAR_SIGMAS * sigma_s, apart < AROUND_SIGMAS * sigma_s
         for part in (slice(offset, None), slice(None, width - offset)):
-            with_it[:, part] += apart < NEAR_SIGMAS * sigma_s
-            around[:, part] += (apart >= NEAR_SIGMAS * sigma_s) & (apart < AROUND_SIGMAS * sigma_s)
+            with_it[:, part] += near
+            around[:, part] += far & ~near
             others[:, part] += np.isfinite(apart)
-    chance = (around + 0.5) * NEAR_SIGMAS / (AROUND_SIGMAS - NEAR_SIGMAS)
-    seen_at_all = np.isfinite(time_s)
-    pairs = np.sum(others[seen_at_all])
-    excess = np.sum((with_it - chance)[seen_at_all])
-    share = min(max(math.sqrt(max(excess, 0.0) / max(pairs, 1.0)), 1e-6), 1 - 1e-6)
-    more = others * share
+        if offset == 1:
+            next_to_it = np.array([np.sum(near) - np.sum(far & ~near) * CHANCE, np.sum(np.isfinite(apart))])
+    # Two neighbours come together where both came from a surface.
+    share = math.sqrt(min(max(next_to_it[0] / max(next_to_it[1], 1.0), 1e-12), 1 - 1e-6))
+    chance = (around + 0.5) * CHANCE
+    more = np.clip(with_it - chance, 1e-9, np.maximum(others * share, 1e-9))
     odds = math.log(share / (1 - share)) + with_it * np.log1p(more / chance) - more
+    seen_at_all = np.isfinite(time_s)
     believed = np.where(seen_at_all, _logistic(odds), 0.0)
     return Peaks(time_s, np.where(seen_at_all, sigma_s, 0.0), seen_at_all * 1.0, believed)
 

@@ -26,7 +26,7 @@ from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
+from rig.strategies.block_matching import bands, best_match, doubtful_at_edges, exposed, independent_values, match
 from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
@@ -141,15 +141,18 @@ def _matched(
     for part, kept in bands(rows):
         seen = np.ascontiguousarray(pair[:, part])
         detail = np.stack([one - cv2.GaussianBlur(one, (0, 0), DETAIL_PX) for one in seen])
-        first, second = detail
+        first, second = seen
         gain = 127 / (FULL_SIGMAS * max(float(np.std(detail)), 1e-6))
         left_8, right_8 = np.clip(128 + gain * detail, 0, 255).astype(np.uint8)
         found = _sgbm(left_8, right_8, least, number)
         independent = independent_values(first, second)
         left, evidence = match(first, _shifted(second, least, number), independent)
         at = np.clip(np.rint(np.nan_to_num(found) - least), 0, number - 1).astype(np.int64)
-        block = best_match(left, evidence, independent, at)
+        block = doubtful_at_edges(best_match(left, evidence, independent, at), 1.0)
         sd = np.hypot(block.sd.astype(np.float64), SUB_PIXEL_PX)
+        # The blocks have a place between pixels of their own, which is not drawn to whole pixels.
+        finer = np.isfinite(found) & (np.abs(block.place - at) < 0.5)
+        found = np.where(finer, least + block.place, found)
         believed = np.where(np.isfinite(found), block.confidence * within(RIGHT * np.nan_to_num(found), sd), 0)
         wanted = slice(part.start + kept.start, part.start + kept.stop)
         disparity[wanted], sure[wanted] = found[kept], believed[kept]
