@@ -32,6 +32,7 @@ Rule = Literal["energy", "irradiance"]
 Counts = NDArray[np.uint32]
 
 MOST_FRAMES = 2**32 - 1
+MOST_POWER_W = 1e6
 SPOTS_AT_ONCE = 4096
 DARK = "dark counts"
 """Name of the effect that only the SPAD has, of those without the source."""
@@ -61,8 +62,8 @@ class Request:
 
     def __post_init__(self) -> None:
         near_m, far_m = self.depth_range_m
-        if not (np.isfinite(self.power_w) and self.power_w >= 0):
-            raise ValueError(f"power_w is {self.power_w:g}; give a finite power of 0 W or more")
+        if not 0 <= self.power_w <= MOST_POWER_W:
+            raise ValueError(f"power_w is {self.power_w:g}; give a power of 0 to {MOST_POWER_W:g} W")
         if self.rule not in ("energy", "irradiance"):
             raise ValueError(f"rule is {self.rule!r}; write energy or irradiance")
         if not 0 < near_m < far_m < np.inf:
@@ -88,9 +89,8 @@ class SimulatedApparatus:
         self._bits = SensorBits(flux, rows, request.frame_s)
         self._electrons = camera.quantum_efficiency * camera.fill_factor
         self._electrons /= setting.sensor.detection_probability * setting.sensor.fill_factor
-        self._light_per_s = (
-            transport.steady_per_s - flux.steady[DARK][rows] if DARK in flux.steady else (transport.steady_per_s)
-        )
+        light = [rate[rows] for name, rate in flux.steady.items() if name != DARK]
+        self._light_per_s = sum(light, np.zeros_like(transport.steady_per_s))
         self._setting = setting
         self._rows_of_fan = rows_of_fan(setting)[rows]
         self._rng = np.random.default_rng(request.seed)
@@ -243,7 +243,8 @@ class SimulatedApparatus:
             return np.float32(self._column_w) * shown, self._column_w * total
         lit = total > 0
         scale = np.divide(self._request.power_w, total, out=np.zeros_like(total), where=lit)
-        return shown * scale.astype(np.float32).reshape(-1, *[1] * (shown.ndim - 1)), self._request.power_w * lit
+        watts = shown * scale.reshape(-1, *[1] * (shown.ndim - 1))
+        return watts.astype(np.float32), self._request.power_w * lit
 
     def _when(self, lasts_s: Array) -> tuple[list[Moment | None], Array]:
         """As `Transport.moments`, for exposures that follow each other from now on."""

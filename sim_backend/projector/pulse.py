@@ -39,6 +39,8 @@ GATE_SIGMAS = 4.0
 MOST_BYTES = 1 << 31
 PART_M = 0.1
 """Length of the parts of a bin over which the medium's light is summed."""
+FAR_SIGMAS = 10.0
+"""Standard deviations of the blur before a surface where the medium is whole."""
 LEAST_RANGE_M = 1e-3
 """Distance from which on the medium sends light back; keeps 1/r^2 finite."""
 
@@ -166,12 +168,12 @@ def expected(
                 b = a + step_m
                 # Share of the part that lies before the surface, whose edge is blurred.
                 lit_above = edge_sum((range_m - b) / sigma_m)
-                share = min(sigma_m * (lit_below - lit_above) / step_m, 1.0) if math.isfinite(lit_above) else 1.0
+                share = sigma_m * (lit_below - lit_above) / step_m if range_m - b < FAR_SIGMAS * sigma_m else 1.0
                 lit_below = lit_above
                 a, b = max(a, LEAST_RANGE_M), max(b, LEAST_RANGE_M)
                 # The integral of 1/r^2, and the extinction where half of it has come in.
                 fog = medium * (b - a) / (a * b) * math.exp(-2.0 * extinction_per_m * math.sqrt(a * b))
-                mean[i] += share * fog
+                mean[i] += min(max(share, 0.0), 1.0) * fog
 
 
 @numba.njit(cache=True, nogil=True)

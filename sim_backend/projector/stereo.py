@@ -1,11 +1,11 @@
 """The scene from a second camera that stands where the light leaves the mirror, and what both cameras see of it.
 
-The second camera has the rays of the first, so it sees a point X in the direction X - S from the source S. The world has
-one depth per pixel of the first camera, and a tangent plane (facet). The strip of this plane that a pixel covers in its
-row goes to an interval of the second picture; of all strips there the nearest is seen, with the albedo at the very place.
-Rows are taken as rectified: a point is in the same row of both pictures, even if the source stands higher or nearer
-than the camera. Pixels to which nothing goes see places that are hidden from the first camera, and get what is next to
-them, of both sides the farther one. On a plane, places are right to 0.01 px. Cost: 40 ms for 512 x 512 pixels.
+The second camera has the rays of the first, so it sees a point X in the direction X - S from the source S. The world
+has one depth per pixel of the first camera, and a tangent plane (facet). The strip of this plane that a pixel covers in
+its row goes to an interval of the second picture; of all strips there the nearest is seen, with the albedo at that very
+place. Rows are taken as rectified: a point is in the same row of both pictures, even if the source stands higher or
+nearer than the camera. Pixels to which nothing goes see places that are hidden from the first camera, and get what is
+next to them, of both sides the farther one. Cost: 40 ms for 512 x 512 pixels.
 
 In ambient light alone a surface of albedo rho at the distance r has the radiance rho/pi E exp(-sigma r), and the air in
 front of it adds airlight, as in `sim_backend.effects.ambient`.
@@ -65,7 +65,7 @@ def second_view(view: CameraView, rows: NDArray[np.int64]) -> Seen:
 
 
 def _columns(u: Array, tangent: Array) -> Array:
-    """Fractional pixels (width,) of a row with tangents u (width,) in which rays of these tangents (width,) are seen."""
+    """Fractional pixels (width,) in which rays of these tangents are seen, of a row with tangents u (width,)."""
     known = np.flatnonzero(np.isfinite(u))
     if len(known) < 2:
         return np.full_like(tangent, np.nan)

@@ -22,7 +22,7 @@ SCOPE = (
     *(f"drivers/{name}.py" for name in ("clock", "frames", "units", "replay/pace", "scanners/galvo")),
     *(f"rig/{folder}/*.py" for folder in ("count", "depth", "estimate", "geometry", "plan")),
     *(f"rig/{name}.py" for name in ("recording/cube", "tradeoff/limits", "tradeoff/row_light", "tradeoff/rows")),
-    *(f"sim_backend/{folder}/*.py" for folder in ("effects", "frames", "light")),
+    *(f"sim_backend/{folder}/*.py" for folder in ("effects", "frames", "light", "projector")),
     *(f"sim_backend/{name}.py" for name in ("mirror_motion", "random_numbers", "scenes/medium", "scenes/scene")),
 )
 """Files whose functions compute; the others move bytes, words and files, which tests/unit and tests/wire hold."""
