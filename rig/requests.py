@@ -184,6 +184,21 @@ class TradeoffRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StrategiesRequest(TradeoffRequest):
+    """Other ways to measure depth beside the line scan, in front of simulated scenes (`rig tradeoff --strategies`).
+
+    Of the options of a trade-off, scenes, fogs, repeat, seed and out hold; the others must be left alone.
+    """
+
+    strategies: Sequence[str] = option((), "ways to measure depth, or all, by commas", unset="none: settings are tried")
+    times: Sequence[str] = option((), "with --strategies: times, by commas", unset="1ms,10ms,50ms,200ms,1s")
+    rules: Sequence[str] = option((), "with --strategies: of energy, irradiance", unset="both")
+    rows: int = option(64, "with --strategies: image rows in the middle of the picture", least=1)
+    lux: float | None = option(None, "with --strategies: ambient light", unset="the scene's, else 5")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SoakRequest:
     """A long stream at the sensor's rate, played in real time (`rig bench --soak`)."""
 

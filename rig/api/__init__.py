@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
     from rig.api.scans import plan_scan, reconstruct, replay, scan
     from rig.api.steering import OnMap, SeenMap
+    from rig.api.strategies import compare_strategies
     from rig.api.tradeoffs import tradeoff
     from rig.bench.soak import soak
     from rig.calibrate.align import align
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
         RunsRequest,
         ScanRequest,
         SoakRequest,
+        StrategiesRequest,
         SyncRequest,
         TradeoffRequest,
     )
@@ -94,6 +96,7 @@ __all__ = [
     "ScanRequest",
     "SeenMap",
     "SoakRequest",
+    "StrategiesRequest",
     "SyncRequest",
     "TradeoffRequest",
     "align",
@@ -106,6 +109,7 @@ __all__ = [
     "calibrate_planes",
     "calibrate_sync",
     "check_config",
+    "compare_strategies",
     "compress",
     "configure",
     "cut",
@@ -146,6 +150,7 @@ _HOMES: Final = {
     "rig.api.past_runs": ("runs",),
     "rig.api.scans": ("plan_scan", "reconstruct", "replay", "scan"),
     "rig.api.steering": ("OnMap", "SeenMap"),
+    "rig.api.strategies": ("compare_strategies",),
     "rig.api.tradeoffs": ("tradeoff",),
     "rig.bench.soak": ("soak",),
     "rig.calibrate.align": ("align",),
@@ -176,6 +181,7 @@ _HOMES: Final = {
         "RunsRequest",
         "ScanRequest",
         "SoakRequest",
+        "StrategiesRequest",
         "SyncRequest",
         "TradeoffRequest",
     ),

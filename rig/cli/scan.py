@@ -1,7 +1,7 @@
 """Commands that make depth maps, and two on what a scene allows: `rig scan`, `reconstruct`, `demo`, `effects`, ..."""
 
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,7 +26,7 @@ from rig.cli.completion import one_of
 from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.live.page import end_page
-from rig.requests import ReconstructRequest, ScanRequest, TradeoffRequest, options_of
+from rig.requests import ReconstructRequest, ScanRequest, StrategiesRequest, TradeoffRequest, options_of
 
 if TYPE_CHECKING:
     from rig.config.models import RigConfig
@@ -169,9 +169,26 @@ def effects_command(
     return Answer(asdict(effects), lambda: tables.effects_table(effects))
 
 
-@asks(TradeoffRequest)
-def tradeoff_command(request: TradeoffRequest, config: ConfigArgument = "simulated") -> Answer:
-    """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use."""
+@asks(StrategiesRequest)
+def tradeoff_command(request: StrategiesRequest, config: ConfigArgument = "simulated") -> Answer:
+    """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use.
+
+    With --strategies, compare other ways to measure depth in the same scenes, with the same light and time.
+    """
+    if request.strategies:
+        from rig.cli.strategies import strategies_tables
+
+        with progress():
+            compared = api.compare_strategies(config, request)
+        aborted = compared.verdict == "aborted"
+        note = "aborted: these are the rows that were whole by then" if aborted else ""
+        code = EXIT_ABORTED if aborted else 0
+        return Answer(compared.as_json(), lambda: strategies_tables(compared), code, note)
+    own = [each for each in fields(StrategiesRequest) if each.name not in _OF_TRADEOFF]
+    if any(getattr(request, each.name) not in (each.default, []) for each in own):
+        raise UsageError(
+            "`times`, `rules`, `rows` and `lux` are for `strategies`; name some, or all, or leave them out"
+        )
     with progress():
         done = api.tradeoff(config, request)
     code, note = 0 if done.wish is None or (done.answer is not None and done.answer.fits) else 1, ""
@@ -183,6 +200,9 @@ def tradeoff_command(request: TradeoffRequest, config: ConfigArgument = "simulat
             "raise --exposures"
         )
     return Answer(done.as_json(), lambda: tables.tradeoff_table(done), code, note)
+
+
+_OF_TRADEOFF = tuple(each.name for each in fields(TradeoffRequest))
 
 
 COMMANDS: Commands = {

@@ -1,0 +1,97 @@
+"""The call that measures depth in other ways beside the line scan: `compare_strategies`."""
+
+from dataclasses import fields, replace
+from typing import Any, Final, cast
+
+from drivers.units import parse_quantity
+from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
+from rig.errors import UsageError, each_or_problems, noted
+from rig.progress import Progress
+from rig.requests import StrategiesRequest, TradeoffRequest
+from rig.run_folder.folder import RunFolder
+from rig.strategies.apparatus import Rule
+from rig.strategies.comparison.compare import LINES, Comparison, Setting, run_comparison
+from rig.strategies.comparison.files import write_files
+from rig.strategies.comparison.places import air_problems
+from rig.strategies.strategy import find_strategy, strategy_names
+
+ALL: Final = "all"
+AIRS: Final = ("clear", "50m", "20m", "10m", "rain", "snow")
+"""Air that is tried if the caller names none: clear air, light, moderate and dense fog, rain and snow."""
+TIMES: Final = ("1ms", "10ms", "50ms", "200ms", "1s")
+RULES: Final[tuple[Rule, ...]] = ("energy", "irradiance")
+SCENES: Final = ("street", "ramp")
+SHARED: Final = ("scenes", "fogs", "repeat", "seed", "out")
+"""Options of a trade-off that hold here too."""
+
+
+def compare_strategies(
+    config: Config = SIMULATED,
+    request: StrategiesRequest | None = None,
+    *,
+    progress: Progress | None = None,
+    **changes: Any,
+) -> Comparison:
+    """Measure depth in many ways, in front of the same simulated scenes with the same light (`rig tradeoff
+    --strategies`).
+
+    request, changes: options, as a `StrategiesRequest` or by the names of its fields:
+      `compare_strategies(strategies=["line-joint", "gray-spad"], fogs=["clear", "20m"])`. No strategy means all.
+    progress: called with the number of measurements done and the total.
+
+    Raises UsageError, one line per problem. An interrupt ends the comparison after the last complete row, with verdict
+    'aborted'.
+    """
+    request = replace(request or StrategiesRequest(), **changes)
+    loaded = configure(config)
+    names = list(dict.fromkeys(request.strategies)) or [ALL]
+    problems = _of_rig_and_request(loaded, request)
+    if names == [ALL]:  # our own way first
+        names = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
+    airs, times = tuple(request.fogs) or AIRS, tuple(request.times) or TIMES
+    problems += air_problems(airs)
+    times_s = []
+    for text in times:
+        try:
+            times_s.append(parse_quantity(text, "time"))
+        except ValueError as wrong:
+            problems.append(f"`times` {wrong}")
+    problems += [f"`times` has {t:g} s; a measurement takes more than 0 s" for t in times_s if t <= 0]
+    with noted(problems):
+        ways = each_or_problems(names, find_strategy)
+    if problems:
+        raise UsageError.of(problems)
+    seeds = range(request.seed, request.seed + request.repeat)
+    rules = cast(tuple[Rule, ...], tuple(request.rules) or RULES)
+    asked = Setting(tuple(request.scenes) or SCENES, airs, times_s, rules, request.rows, request.lux, seeds)
+    if request.out is None:
+        return run_comparison(loaded, ways, asked, progress)
+    with RunFolder(request.out) as folder:
+        return write_files(folder, run_comparison(loaded, ways, asked, progress))
+
+
+def _of_rig_and_request(config: Any, request: StrategiesRequest) -> list[str]:
+    """Problems with a rig and options; the names of strategies, air and times apart."""
+    problems = []
+    if config.world is None or config.world.real_time:
+        problems.append(f"{config.name} has no simulated world of its own time; name a rig that has, '{SIMULATED}'")
+    if len(config.line_offsets) > 1:
+        problems.append(f"{config.name} has {len(config.line_offsets)} lines; name a rig with one, '{SIMULATED}'")
+    if config.scan.columns < LINES:
+        problems.append(f"scan.columns is {config.scan.columns}; ways to measure depth need at least {LINES}")
+    own = {each.name for each in fields(StrategiesRequest)} - {each.name for each in fields(TradeoffRequest)}
+    for each in fields(StrategiesRequest):
+        if each.name not in own and each.name not in SHARED and getattr(request, each.name) not in (each.default, []):
+            problems.append(f"`{each.name}` says nothing with `strategies`; leave one of them out")
+    problems += [
+        f"`rules` has {rule!r}; the rules are {' and '.join(RULES)}" for rule in request.rules if rule not in RULES
+    ]
+    if request.rows < 1:
+        problems.append(f"`rows` is {request.rows}; at least one row is measured")
+    if request.lux is not None and not 0 <= request.lux <= 1e6:
+        problems.append(f"`lux` is {request.lux:g}; ambient light is 0 to 1e6 lux")
+    if request.repeat < 1:
+        problems.append(f"repeat is {request.repeat}; it must be at least 1")
+    if not 0 <= request.seed <= MAX_SEED - request.repeat:
+        problems.append(f"seed is {request.seed}; it must be 0 or more and at most {MAX_SEED - request.repeat}")
+    return problems

@@ -1,0 +1,297 @@
+"""Measures with every way to measure depth in front of the same scenes, and tabulates how well each one did.
+
+Every measurement has the same camera, the same power of its source, the same ambient light and the same time. Each
+seed makes all of them anew. A row is one way in one scene, air, rule and time.
+"""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from calibration.model.rig_model import RigModel
+from drivers.errors import DeviceError
+from rig.config.models import RigConfig
+from rig.config.overrides import configure
+from rig.errors import RigError, UsageError
+from rig.plan.scan_plan import column_command
+from rig.progress import part, tell_stage
+from rig.simd import Float32, Float64
+from rig.strategies.apparatus import Budget, MakesApparatus, Rule
+from rig.strategies.comparison.eye_safety import Field, LaserClass, class_of
+from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
+from rig.strategies.comparison.score import GOOD, Score, score, scored_pixels
+from rig.strategies.strategy import Answer, ColumnGeometry, Light, Strategy, TooShort
+from rig.tradeoff.effects import open_world
+
+LINES: Final = 8
+"""The number of columns is a multiple of this, so that as many lines can share them."""
+OVERSPENT: Final = 1e-6
+"""Share of the time by which a measurement may exceed it, for rounding."""
+REACHED: Final = 0.9
+"""Share of a distance's pixels that must be good for the distance to be reached."""
+BINS_PER_E: Final = 10.0
+"""Bins of distance, per factor of e: 10 % wide."""
+FEWEST: Final = 30
+"""Pixels that a bin of distance needs to count."""
+PULSE_S: Final = 1e-10
+"""Length of a flash, for its laser class only."""
+GREEN_M: Final = 520e-9
+WIDE_FAN_RAD: Final = math.radians(50)
+
+PROTECTED: Final = "simulation for comparison only"
+"""Words in the sentence of a strategy whose patterns are protected by others; they are said when it runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is compared. times_s: of a measurement. rows: number of image rows in the middle of the picture. lux:
+    ambient light, None for each scene's own. airs: None is a scene's own."""
+
+    scenes: Sequence[str]
+    airs: Sequence[str | None]
+    times_s: Sequence[float]
+    rules: Sequence[Rule]
+    rows: int
+    lux: float | None
+    seeds: range
+
+
+@dataclass(frozen=True, slots=True)
+class StrategyRow:
+    """One way to measure depth in one scene and air, by one rule, within one time; means over all seeds.
+
+    air: a visibility, clear, rain or snow; None for the scene's own. mean_px, median_px, good, valid, confident_wrong:
+    as in `Score`; None if the way cannot measure in so short a time, which `too_short` then says. spread_px: standard
+    deviation of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance
+    at which 90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms, energy_mj: sensor time and
+    light. compute_s: seconds of the computer, simulation included. laser_class, laser_class_still: of the source while
+    it works, and if it stood still; None without a source.
+    """
+
+    strategy: str
+    light: Light
+    scene: str
+    air: str | None
+    rule: Rule
+    time_ms: float
+    pixels: int
+    mean_px: float | None = None
+    spread_px: float | None = None
+    median_px: float | None = None
+    median_mm: float | None = None
+    good: float | None = None
+    valid: float | None = None
+    confident_wrong: float | None = None
+    range_m: float | None = None
+    spent_ms: float | None = None
+    energy_mj: float | None = None
+    compute_s: float = 0.0
+    laser_class: LaserClass | None = None
+    laser_class_still: LaserClass | None = None
+    too_short: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Result of a comparison: all rows. verdict: 'aborted' if an interrupt ended it; the rows are then those that were
+    complete. sentences: what each way does. notes: what has to be said of some ways. folder: where it was written."""
+
+    rows: tuple[StrategyRow, ...]
+    sentences: Mapping[str, str]
+    notes: tuple[str, ...]
+    verdict: Literal["complete", "aborted"]
+    folder: Path | None = None
+
+    @property
+    def seconds(self) -> dict[str, dict[str, float]]:
+        """Seconds of the computer by strategy and scene."""
+        found: dict[str, dict[str, float]] = {}
+        for row in self.rows:
+            of = found.setdefault(row.strategy, {})
+            of[row.scene] = of.get(row.scene, 0.0) + row.compute_s
+        return found
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as plain values."""
+        return {
+            "rows": [asdict(row) for row in self.rows],
+            "strategies": dict(self.sentences),
+            "notes": list(self.notes),
+            "seconds": self.seconds,
+            "verdict": self.verdict,
+        }
+
+
+def run_comparison(
+    config: RigConfig, ways: Sequence[Strategy], asked: Setting, progress: Callable[[int, int], None] | None = None
+) -> Comparison:
+    """Measure with all ways and tabulate. progress: called with the number of measurements done and the total.
+
+    Raises UsageError if a scene cannot be used, and RigError if a strategy takes more time than it has. An interrupt
+    ends the comparison after the last complete row; before the first one it is raised again.
+    """
+    rows: list[StrategyRow] = []
+    verdict: Literal["complete", "aborted"] = "complete"
+    total = len(ways) * len(asked.scenes) * len(asked.airs) * len(asked.times_s) * len(asked.rules)
+    try:
+        with TemporaryDirectory() as made:
+            for row in _rows(config, ways, asked, Path(made)):
+                rows.append(row)
+                if progress is not None:
+                    progress(len(rows), total)
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+        verdict = "aborted"
+    notes = tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
+    return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
+
+
+def _rows(config: RigConfig, ways: Sequence[Strategy], asked: Setting, folder: Path) -> Iterator[StrategyRow]:
+    model = rig_model(config)
+    for scene, air in product(asked.scenes, asked.airs):
+        name = scene.rstrip("/").rsplit("/", 1)[-1]
+        with part(name if air is None else f"{name}, {air}"):
+            tell_stage("making the scene")
+            file = scene_file(scene, air, asked.lux, model, folder)
+            yield from _of_place(configure(config, scene=str(file)), model, ways, asked, (name, air))
+
+
+def _of_place(
+    config: RigConfig, model: RigModel, ways: Sequence[Strategy], asked: Setting, place: tuple[str, str | None]
+) -> Iterator[StrategyRow]:
+    """The rows of one scene and air."""
+    scan = config.scan
+    columns = scan.columns // LINES * LINES
+    commands = np.array([column_command(column, scan.command_range, columns) for column in range(columns)])
+    height = model.camera.height
+    measured = min(asked.rows, height)
+    rows = np.arange(measured) + (height - measured) // 2
+    geometry = ColumnGeometry(model, commands, scan.depth_range, rows)
+    frame_s = float(1 / scan.frame_rate)
+    with open_world(config) as (world, power_w):
+        opened: Any = world
+        if not isinstance(opened, MakesApparatus):
+            raise UsageError("this world cannot be measured in other ways than with a scanned line")
+        truth = world.truth(commands)
+        scored = scored_pixels(truth, geometry)
+        true_m = truth.depth_m[rows][scored]
+        if not scored.any():
+            raise UsageError(f"scene {place[0]}: the source lights nothing that the camera sees; check the scene")
+
+        def measure(way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, float, float]:
+            try:
+                apparatus = opened.apparatus(
+                    rows=rows, columns=columns, command_range=scan.command_range, power_w=power_w, rule=rule, seed=seed,
+                    depth_range_m=scan.depth_range, spad_frame_s=frame_s,
+                )  # fmt: skip
+            except DeviceError as error:
+                raise UsageError(f"scene {place[0]}: {error}") from error
+            answer = way.measure(apparatus, geometry, Budget(time_s), seed)
+            spent = apparatus.spent
+            if spent.time_s > time_s * (1 + OVERSPENT):
+                raise RigError(
+                    f"{way.name} took {spent.time_s * 1e3:g} ms of {time_s * 1e3:g} ms; correct the strategy"
+                )
+            return answer, spent.time_s, spent.energy_j
+
+        for rule, time_s, way in product(asked.rules, asked.times_s, ways):
+            tell_stage(f"{way.name}, {time_s * 1e3:g} ms")
+            row = StrategyRow(way.name, way.light, *place, rule, 1e3 * time_s, len(true_m))
+            classes = _classes(config, geometry, way.light, power_w, rule, time_s)
+            row = replace(row, laser_class=classes[0], laser_class_still=classes[1])
+            begun = time.perf_counter()
+            scores: list[Score] = []
+            reached = Reached(true_m)
+            spent_s = energy_j = 0.0
+            try:
+                for seed in asked.seeds:
+                    answer, spent_s, energy_j = measure(way, rule, time_s, seed)
+                    scores.append(score(answer, truth, geometry, scored))
+                    reached.add(answer.depth_m[scored])
+            except TooShort as why:
+                yield replace(row, too_short=str(why), compute_s=time.perf_counter() - begun)
+                continue
+            row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=1e3 * spent_s)
+            yield replace(row, energy_mj=1e3 * energy_j, compute_s=time.perf_counter() - begun)
+
+
+def _means(scores: Sequence[Score]) -> dict[str, Any]:
+    """Fields of a row from the scores of all seeds."""
+    medians = [each.median_px for each in scores if each.median_px is not None]
+    metres = [each.median_m for each in scores if each.median_m is not None]
+    means = [each.mean_px for each in scores]
+    return {
+        "mean_px": statistics.fmean(means),
+        "spread_px": statistics.stdev(means) if len(means) > 1 else None,
+        "median_px": statistics.fmean(medians) if medians else None,
+        "median_mm": 1e3 * statistics.fmean(metres) if metres else None,
+        "good": statistics.fmean(each.good for each in scores),
+        "valid": statistics.fmean(each.valid for each in scores),
+        "confident_wrong": statistics.fmean(each.confident_wrong for each in scores),
+    }
+
+
+class Reached:
+    """Counts good answers by distance. true_m: (pixels,), depth of all scored pixels."""
+
+    def __init__(self, true_m: Float32) -> None:
+        self._true_m = true_m.astype(np.float64)
+        self._bin = np.floor(BINS_PER_E * np.log(self._true_m)).astype(np.int64)
+        self._bin -= self._bin.min()
+        self._good = np.zeros(int(self._bin.max()) + 1)
+        self._all = np.zeros_like(self._good)
+
+    def add(self, depth_m: Float32) -> None:
+        """Add an answer's depths (pixels,), NaN where there is none."""
+        with np.errstate(invalid="ignore"):
+            good = np.abs(depth_m - self._true_m) <= GOOD * self._true_m
+        self._good += np.bincount(self._bin, weights=good, minlength=len(self._good))
+        self._all += np.bincount(self._bin, minlength=len(self._all))
+
+    def range_m(self) -> float | None:
+        """The farthest depth of the farthest bin in which at least REACHED of the answers were good; None if none."""
+        counts = np.bincount(self._bin, minlength=len(self._all)) >= FEWEST
+        far = np.flatnonzero(counts & (self._good >= REACHED * np.maximum(self._all, 1)))
+        return float(self._true_m[self._bin == far[-1]].max()) if len(far) else None
+
+
+def _classes(
+    config: RigConfig, geometry: ColumnGeometry, light: Light, power_w: float, rule: Rule, time_s: float
+) -> tuple[LaserClass | None, LaserClass | None]:
+    """Laser classes of a source while it works, and if it stood still."""
+    if light == "ambient":
+        return None, None
+    line: Any = getattr(config.world, "line", None)
+    wavelength_m = float(getattr(line, "wavelength", GREEN_M))
+    fan_rad = float(getattr(line, "fan", WIDE_FAN_RAD))
+    normals: Float64 = geometry.model.planes(geometry.commands[[0, -1]])[:, :3]
+    scan_rad = math.acos(min(1.0, abs(float(normals[0] @ normals[1]))))
+    height = geometry.model.camera.height
+    if rule == "irradiance" and light in ("line", "spot"):
+        power_w /= geometry.columns / 2 * (height if light == "spot" else 1)
+    field = Field(power_w, fan_rad, scan_rad)
+    beams = {
+        "spot": field.spot(time_s, height),
+        "line": field.line(time_s),
+        "pattern": field.pattern(),
+        "flash": field.flash(PULSE_S, float(config.scan.frame_rate)),
+    }[light]
+    return class_of(beams[0], wavelength_m), class_of(beams[1], wavelength_m)
+
+
+def ranges(rows: Sequence[StrategyRow], scene: str) -> dict[tuple[str, float, Rule], dict[str, float | None]]:
+    """Range in metres by (strategy, time in ms, rule) and air, in one scene. Only air of a known visibility."""
+    found: dict[tuple[str, float, Rule], dict[str, float | None]] = {}
+    for row in rows:
+        if row.scene == scene and row.air is not None and visibility_m(row.air) is not None and row.too_short is None:
+            found.setdefault((row.strategy, row.time_ms, row.rule), {})[row.air] = row.range_m
+    return found

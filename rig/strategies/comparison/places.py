@@ -1,0 +1,125 @@
+"""Scenes in different air, as files that a simulated world reads: fog of a visibility, rain, snow, or clear air.
+
+A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall that recedes from 1.2 to 14 m, with
+random texture, on which every distance can be tried. Air replaces what the scene has in its own; ambient light is the
+scene's own, or that of the bundled scenes where it has none.
+"""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+
+from calibration.errors import CalibrationError
+from calibration.files.rig_file import load_rig_model
+from calibration.model.rig_model import RigModel
+from drivers.units import parse_quantity
+from rig.config.bundled import bundled_scenes
+from rig.config.models import RigConfig
+from rig.errors import UsageError
+
+CLEAR: Final = "clear"
+WEATHER: Final[dict[str, dict[str, Any]]] = {
+    "rain": {"rain": {"rate": "20 mm/h", "wind": "1 m/s"}},
+    "snow": {"snow": {"rate": "2 mm/h", "wind": "0.5 m/s"}},
+}
+"""Air by name: heavy rain and moderate snow, as in the bundled scenes."""
+USUAL_LUX: Final = 5.0
+"""Ambient light of a scene that has none of its own, that of the bundled scenes: a street at night."""
+RAMP: Final = "ramp"
+RAMP_M: Final = (1.2, 14.0)
+TEXTURE_PX: Final = 6
+"""Size of the patches of the ramp's texture."""
+ALBEDO: Final = (0.2, 0.8)
+
+
+def air_problems(airs: "list[str] | tuple[str, ...]") -> list[str]:
+    """A line for each air that is none."""
+    problems = []
+    for air in airs:
+        if air == CLEAR or air in WEATHER:
+            continue
+        try:
+            visible = parse_quantity(air, "length") > 0
+        except ValueError:
+            visible = False
+        if not visible:
+            problems.append(f"fog {air!r} is no air; write a visibility such as 20m, or {CLEAR}, {', '.join(WEATHER)}")
+    return problems
+
+
+def visibility_m(air: str | None) -> float | None:
+    """Visibility of an air in metres; infinite for clear air, None for rain, snow and a scene's own air."""
+    if air is None or air in WEATHER:
+        return None
+    return float("inf") if air == CLEAR else parse_quantity(air, "length")
+
+
+def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, folder: Path) -> Path:
+    """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if it cannot be read.
+
+    air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: of the camera, for `ramp`.
+    """
+    content = _content(scene, model, folder)
+    if air is not None:
+        content = {key: value for key, value in content.items() if key not in ("medium", "rain", "snow")}
+        if air in WEATHER:
+            content |= WEATHER[air]
+        elif air != CLEAR:
+            content["medium"] = {"fog": {"visibility": air}}
+    if lux is not None or "ambient" not in content:
+        content["ambient"] = {"illuminance": f"{USUAL_LUX if lux is None else lux:g} lux"}
+    file = folder / f"scene-{len(list(folder.iterdir()))}.yaml"
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return file
+
+
+def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
+    bundled = {each.name: each.file for each in bundled_scenes()}
+    path = bundled.get(scene, Path(scene).expanduser())
+    if scene == RAMP:
+        return {"surfaces": str(_ramp(model, folder))}
+    if path.is_dir():
+        return {"surfaces": str(path.resolve())}
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        reason = str(error).partition("\n")[0]
+        raise UsageError(
+            f"scene {scene!r} cannot be read ({reason}); name a bundled scene, a scene file, a folder or {RAMP!r}"
+        ) from error
+    if not isinstance(content, dict):
+        raise UsageError(f"scene {scene!r} is no scene file; it must be a mapping such as 'surfaces: street'")
+    surfaces = content.get("surfaces", "street")
+    if isinstance(surfaces, str) and surfaces not in ("street", "board"):
+        content["surfaces"] = str((path.parent / surfaces).resolve())
+    return content
+
+
+def _ramp(model: RigModel, folder: Path) -> Path:
+    """A folder with the surfaces of `ramp`: nearest on the side where the source stands."""
+    made = folder / RAMP
+    if not made.exists():
+        rows, width = model.camera.height, model.camera.width
+        near_m, far_m = RAMP_M
+        inverse = np.linspace(1 / near_m, 1 / far_m, width)
+        if model.source_m is not None and model.source_m[0] > 0:
+            inverse = inverse[::-1]
+        rng = np.random.default_rng(1)
+        patches = rng.uniform(*ALBEDO, (-(-rows // TEXTURE_PX), -(-width // TEXTURE_PX)))
+        texture = patches.repeat(TEXTURE_PX, axis=0).repeat(TEXTURE_PX, axis=1)[:rows, :width]
+        made.mkdir()
+        depth_m = np.broadcast_to(1 / inverse, (rows, width)).astype(np.float32)
+        np.savez(made / "world.npz", depth_m=depth_m, albedo=texture.astype(np.float32))
+    return made
+
+
+def rig_model(config: RigConfig) -> RigModel:
+    """The calibrated rig of a config. Raises UsageError if the config has no calibration, or an unreadable one."""
+    if config.calibration is None:
+        raise UsageError(f"{config.name} has no calibration, so no depth; name one in the config")
+    try:
+        return load_rig_model(config.calibration)
+    except CalibrationError as error:
+        raise UsageError(f"calibration {error}") from error
