@@ -30,8 +30,8 @@ ROWS_AT_ONCE: Final = 48
 """Rows that are matched together; bounds the memory to some tens of megabytes."""
 LAGS_PX: Final = 3
 """Largest lag of the autocorrelations."""
-PEAK: Final = 2
-"""Hypotheses to either side of the best one that belong to the same answer."""
+PEAK_PX: Final = 1.0
+"""Pixels of disparity to either side of the best hypothesis that belong to the same answer."""
 EXPOSED: Final = 0.7
 """Share of the full scale that the brightest pixels may reach."""
 BRIGHTEST: Final = 99.5
@@ -131,9 +131,14 @@ def independent_values(picture: Float32, reference: Float32) -> float:
     return block / min(max(total, 1.0), block)
 
 
-def best_match(left: Float32, evidence: Float32, independent: float, at: NDArray[np.int64] | None = None) -> Matches:
-    """The best hypothesis of each pixel. left, evidence: as of `match`. at: (rows, width) of given hypotheses, of which
-    the confidence is asked; the best by default.
+def best_match(
+    left: Float32, evidence: Float32, independent: float, step_px: float, at: NDArray[np.int64] | None = None
+) -> Matches:
+    """The best hypothesis of each pixel. left, evidence: as of `match`. step_px: pixels of disparity between two
+    hypotheses. at: (rows, width) of given hypotheses, of which the confidence is asked; the best by default.
+
+    Where a block lies over a depth edge, it matches the surface with more contrast, and its middle may lie on the
+    other one. So where confident answers within a block are more than `EDGE_PX` apart, either surface has even odds.
     """
     number = len(evidence)
     peak = np.argmax(evidence, axis=0)
@@ -141,7 +146,8 @@ def best_match(left: Float32, evidence: Float32, independent: float, at: NDArray
     most = np.maximum(evidence.max(axis=0), 0)
     weight = np.exp(evidence - most)
     near = np.zeros_like(most)
-    for step in range(-PEAK, PEAK + 1):
+    reach = max(round(PEAK_PX / step_px), 1)
+    for step in range(-reach, reach + 1):
         index = best + step
         taken = np.take_along_axis(weight, index.clip(0, number - 1)[None], axis=0)[0]
         near += np.where((index >= 0) & (index < number), taken, 0)
@@ -156,25 +162,19 @@ def best_match(left: Float32, evidence: Float32, independent: float, at: NDArray
     least = np.maximum(here - bend * offset**2, float(LEAST_LEFT))
     sd = np.sqrt(least / (independent * bend))
     shown = np.isfinite(evidence.max(axis=0))
-    return Matches(
-        np.where(shown, best + offset, np.nan).astype(np.float32), np.where(shown, sd, 0).astype(np.float32),
-        np.where(shown, np.minimum(confidence, 1), 0).astype(np.float32),
-    )  # fmt: skip
+    place = np.where(shown, best + offset, np.nan).astype(np.float32)
+    confidence = np.where(shown, np.minimum(confidence, 1), 0).astype(np.float32)
+    edge = _over_an_edge(np.float32(step_px) * place, confidence)
+    return Matches(place, np.where(shown, sd, 0).astype(np.float32), np.where(edge, 0.5 * confidence, confidence))
 
 
-def doubtful_at_edges(matches: Matches, step_px: float) -> Matches:
-    """The matches with less confidence where a block lies over a depth edge.
-
-    A block that shows two surfaces matches the one with more contrast, and its middle may lie on the other. So where
-    confident answers within a block are more than `EDGE_PX` apart, either surface has even odds. step_px: pixels of
-    disparity between two hypotheses.
-    """
-    sure = matches.confidence >= 0.5
+def _over_an_edge(place_px: Float32, confidence: Float32) -> Bools:
+    """Whether confident answers within the block around each pixel lie on different surfaces, (rows, width)."""
+    sure = confidence >= 0.5
     rows, width = (min(size, 2 * extent - 1) for size, extent in zip(BLOCK_PX, sure.shape, strict=True))
     block = np.ones((rows, width), np.uint8)
-    low, high = (np.where(sure, matches.place, nowhere).astype(np.float32) for nowhere in (NOWHERE, -NOWHERE))
-    edge = step_px * (cv2.dilate(high, block) - cv2.erode(low, block)) > EDGE_PX
-    return matches._replace(confidence=np.where(edge, 0.5 * matches.confidence, matches.confidence).astype(np.float32))
+    low, high = (np.where(sure, place_px, nowhere).astype(np.float32) for nowhere in (NOWHERE, -NOWHERE))
+    return np.asarray(cv2.dilate(high, block) - cv2.erode(low, block) > EDGE_PX, np.bool_)
 
 
 NOWHERE: Final = 1e9

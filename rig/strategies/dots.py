@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.block_matching import bands, best_match, doubtful_at_edges, exposed, independent_values, match
+from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
 from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
@@ -26,7 +26,7 @@ DOT_ROWS, DOT_COLUMNS = 2, 2
 """Size of a dot: about two pixels, as large as the picture of a point of Kinect's on its sensor."""
 LIT: Final = 0.25
 """Share of the places of the pattern that are lit."""
-STEP_PX: Final = 0.5
+STEP_PX: Final = 1 / 3
 """Distance between neighbouring hypotheses, in pixels of disparity."""
 NODES: Final = 33
 """Inverse depths at which the columns of all pixels are solved for; between them they are interpolated linearly, with
@@ -90,8 +90,7 @@ def depth_of_dots(picture: Float32, shown: Float32, geometry: ColumnGeometry) ->
     for rows, kept in bands(geometry.rows):
         known = list(_references(fine[rows], columns[:, rows], (inverse - low) / (high - low) * (NODES - 1)))
         independent = independent_values(picture[rows], known[number // 2][0])
-        found = best_match(*match(picture[rows], iter(known), independent), independent)
-        found = doubtful_at_edges(found, STEP_PX)
+        found = best_match(*match(picture[rows], iter(known), independent), independent, STEP_PX)
         step = inverse[1] - inverse[0]
         at = np.interp(found.place, np.arange(number), inverse)
         sure = found.confidence * within(RIGHT * at, step * found.sd.astype(np.float64))

@@ -26,7 +26,7 @@ from calibration.model.rig_model import RigModel
 from rig.errors import UsageError
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.block_matching import bands, best_match, doubtful_at_edges, exposed, independent_values, match
+from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
 from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
@@ -148,7 +148,7 @@ def _matched(
         independent = independent_values(first, second)
         left, evidence = match(first, _shifted(second, least, number), independent)
         at = np.clip(np.rint(np.nan_to_num(found) - least), 0, number - 1).astype(np.int64)
-        block = doubtful_at_edges(best_match(left, evidence, independent, at), 1.0)
+        block = best_match(left, evidence, independent, 1.0, at)
         sd = np.hypot(block.sd.astype(np.float64), SUB_PIXEL_PX)
         # The blocks have a place between pixels of their own, which is not drawn to whole pixels.
         finer = np.isfinite(found) & (np.abs(block.place - at) < 0.5)
