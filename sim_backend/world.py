@@ -299,12 +299,12 @@ class SimulatedWorld:
 
         at = checked_rows(rows, self.size[0])
         commands = checked_columns(columns, command_range, self.model.scanner.command_range)
-        key = at.tobytes(), commands.tobytes()
-        if self._shown is None or self._shown[0] != key:
-            self._shown = None  # the memory of the old one is needed for the new
+        key, kept = (at.tobytes(), commands.tobytes()), self._shown
+        if kept is None or kept[0] != key:
+            self._shown = kept = None  # the new one may need the memory of the old one
             _, flux = plan_effects(self.setting, self.sampled_planes, LONGEST, self.config.effects)
-            self._shown = key, Transport(self.model, flux, at, commands), flux
-        return self._shown[1:]
+            self._shown = kept = key, Transport(self.model, flux, at, commands), flux
+        return kept[1:]
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
         """A source of frames with this timing. threads: most threads that it uses."""
