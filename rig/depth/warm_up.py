@@ -1,6 +1,7 @@
 """Compiles the kernels of an estimate before a run, so that its times do not include compiling (`rig warmup`)."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -21,8 +22,10 @@ MAPS = 2
 """The first map is learned from, the second one is estimated while its frames come."""
 
 
+@cache
 def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
-    """Estimate two small synthetic maps with this number of exposures, and throw them away.
+    """Estimate two small synthetic maps with this number of exposures, and throw them away. Does nothing the second
+    time: then the program has what was compiled.
 
     dark: whether the run will have dark frames. numba keeps compiled code on disk, so only the first run ever waits.
     """

@@ -28,6 +28,7 @@ NOT_RUN: Mapping[str, str] = {
     r"rig (scan lab|replay taken)": "devices are missing or take real time: tests/system/test_lab_emulated.py",
     r"rig .* /data/": "names folders of other computers",
     r"rig (bench|warmup)": "measures this machine, for a minute: tests/system/cli/test_cli_commands.py",
+    r"rig effects$": "scans with and without each effect: tests/system/cli/test_cli_commands.py",
     r"rig record\b": "acts on a scan that goes on: tests/system/scans/test_record_on_request.py",
     r"rig (stream|view|align|demo)\b|rig .* --view\b": "goes on until it is stopped: tests of its own",
     r"rig record|rig scan .*--record-on-request": "needs a scan that goes on: tests/system/scans",
