@@ -47,8 +47,8 @@ _log = logging.getLogger(__name__)
 NOTICE: Final = "simulation for comparison only: such patterns are subject of US 2023/0410333"
 PRIMITIVE: Final = {4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001, 8: 0b100011101}
 """Primitive polynomial of the field with 2^m elements by m (S. Lin, D. J. Costello, "Error Control Coding", app. A)."""
-CODES: Final = {31: 11, 63: 10, 127: 15, 255: 13}
-"""Message bits of BCH codes by length, with words enough for a projector; they correct 5, 13, 27 and 59 errors."""
+CODES: Final = {31: (11, 11), 63: (10, 27), 127: (15, 55), 255: (13, 119)}
+"""BCH codes with words enough for a projector: message bits, and bits in which two words differ at least, by length."""
 MOST_REPEATED: Final = 13
 """Repetitions of a Gray code; thirteen are as long as BCH(255, 13) with pattern and inverse of 10 bits."""
 BLOCK: Final = 8
@@ -126,7 +126,8 @@ def _balanced_words(length: int, numbers: int) -> Uint8:
     The sum of three words is a word. Where light of neighbouring columns mixes, what is read resembles that sum; if few
     words of many are in use, it is hardly ever one of them.
     """
-    words = bch_words(length, CODES[length], np.arange(2 ** CODES[length]))
+    message_bits = CODES[length][0]
+    words = bch_words(length, message_bits, np.arange(2**message_bits))
     words = np.random.default_rng(length).permutation(words)
     uneven = np.abs(2 * words.sum(axis=1, dtype=np.int64) - length)
     return words[np.argsort(uneven, kind="stable")[:numbers]]
@@ -134,36 +135,42 @@ def _balanced_words(length: int, numbers: int) -> Uint8:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeBook:
-    """Code words (numbers, patterns), uint8, of columns; they repeat. fine: patterns in which the place between two
-    columns shows, as all neighbours differ there in the same way."""
+    """Code words (numbers, patterns), uint8, of columns; they repeat.
+
+    same: (patterns,), the same number for patterns that are repetitions of each other. fine: patterns in which the
+    place between two columns shows, as all neighbours differ there in the same way.
+    """
 
     words: Uint8
+    same: Int64
     fine: slice
 
 
 def code_book(kind: Words, numbers: int, frames: int) -> CodeBook:
     """Code book for at least so many columns, after which it repeats, with at most so many patterns as frames.
 
-    Raises `TooShort` if even the shortest has more.
+    Of the codes that fit, the one whose words differ most in the frames that it uses of those there are, all patterns
+    getting equally many. Raises `TooShort` if even the shortest has more patterns.
     """
-    if kind == "bch":
-        lengths = [length for length, bits in CODES.items() if 2**bits - 2 >= numbers]
-        length = max((n for n in lengths if n <= frames), default=0)
-        return CodeBook(_balanced_words(_enough(kind, length, lengths[0], frames), numbers), slice(None))
     if kind == "repetition":
         bits = bits_for(numbers)
         gray = gray_code(bits, 2**bits).T
         pairs = np.stack([gray, 1 - gray], axis=2).reshape(len(gray), -1)
-        times = min(MOST_REPEATED, frames // pairs.shape[1])
-        return CodeBook(np.tile(pairs, (1, _enough(kind, times, pairs.shape[1], frames))), slice(None))
+        repeated = {times: (times * pairs.shape[1], 2 * times) for times in range(1, MOST_REPEATED + 1)}
+        words = np.tile(pairs, (1, _most_different(kind, repeated, frames)))
+        return CodeBook(words, np.arange(words.shape[1]) % pairs.shape[1], slice(None))
+    if kind == "bch":
+        lengths = {n: (n, apart) for n, (bits, apart) in CODES.items() if 2**bits - 2 >= numbers}
+        length = _most_different(kind, lengths, frames)
+        return CodeBook(_balanced_words(length, numbers), np.arange(length), slice(None))
+    lengths = {n: (n + _stripes(n), apart) for n, (_, apart) in CODES.items() if n <= LONGEST_HYBRID}
+    length = _most_different(kind, lengths, frames)
     blocks = 2 * -(-numbers // (2 * BLOCK))
-    lengths = [n for n, bits in CODES.items() if 2**bits - 2 >= blocks and n <= LONGEST_HYBRID]
-    length = max((n for n in lengths if _stripes(n) + n <= frames), default=0)
-    length = _enough(kind, length, lengths[0] + _stripes(lengths[0]), frames)
     coarse = np.repeat(_balanced_words(length, blocks), BLOCK, axis=0)
     shift = (np.arange(blocks * BLOCK)[:, None] + np.arange(2 * BLOCK)) % (2 * BLOCK)
     stripes = np.tile((shift < BLOCK).astype(np.uint8), (1, _stripes(length) // shift.shape[1]))
-    return CodeBook(np.concatenate([coarse, stripes], axis=1), slice(length, None))
+    same = np.concatenate([np.arange(length), length + np.arange(_stripes(length)) % shift.shape[1]])
+    return CodeBook(np.concatenate([coarse, stripes], axis=1), same, slice(length, None))
 
 
 def _stripes(length: int) -> int:
@@ -171,10 +178,13 @@ def _stripes(length: int) -> int:
     return 2 * BLOCK * -(-length // (2 * BLOCK))
 
 
-def _enough(kind: str, found: int, least: int, frames: int) -> int:
-    if not found:
+def _most_different(kind: str, codes: dict[int, tuple[int, int]], frames: int) -> int:
+    """Of codes with their number of patterns and the bits in which two words differ at least, the one that differs in
+    most frames; of several the last."""
+    least = min(patterns for patterns, _ in codes.values())
+    if least > frames:
         raise TooShort(f"the shortest {kind} code takes {least} frames, the budget has {frames}")
-    return found
+    return max(codes, key=lambda code: (codes[code][1] * (frames // codes[code][0]), code))
 
 
 def packed(bits: NDArray[np.generic]) -> NDArray[np.uint64]:
@@ -218,34 +228,34 @@ class Decoder:
 
     def nearest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
         """Columns (width,) whose words differ in the fewest bits from what one row's pixels saw, the standard deviation
-        of the column, and the probability that it is right. counts: (width, patterns).
-
-        Bits are taken to be read wrong as often as they differ from the word that is chosen.
-        """
+        of the column, and the probability that it is right, from the counts. counts: (width, patterns)."""
         words, patterns = self.book.words, self.book.words.shape[1]
         bits = counts.astype(np.int64) * patterns > counts.sum(axis=1, dtype=np.int64, keepdims=True)
-        differ = window.of(differing_bits(packed(bits), packed(words)))
-        place = window.best(-differ)
-        wrong = (differ[np.arange(len(place)), place] + 0.5) / (patterns + 1.0)
-        log_odds = np.log1p(-np.minimum(wrong, 0.5)) - np.log(np.minimum(wrong, 0.5))
-        right = window.right(-differ * log_odds[:, None], place)
-        return window.column(place), np.full(len(place), QUANTISED_SD), right
+        place = window.best(-window.of(differing_bits(packed(bits), packed(words))))
+        evidence = window.of(self._evidence(counts))
+        right, spread = window.right(evidence / self._excess(counts, self._number(window, place))[:, None], place)
+        return window.column(place), np.hypot(QUANTISED_SD, spread), right
 
     def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
         """The same for the likeliest words. Between two columns the share of their light tells how far."""
-        words, frames = self.book.words, self.frames
-        patterns, lit = words.shape[1], words.sum(axis=1, dtype=np.int64)
-        total = counts.sum(axis=1, dtype=np.int64)[:, None]
-        table = log_factorials(frames * patterns + 1)
-        in_lit = _in_lit(counts, words)
-        evidence = log_evidence(in_lit, lit * frames, frames * patterns, total, table)
-        seen = window.of(evidence)
-        place = window.best(seen)
-        number = np.mod(window.columns[np.arange(len(place)), place], len(words))
-        excess = _excess(counts, words[number], frames)
-        right = window.right(seen / excess[:, None], place)
+        evidence = window.of(self._evidence(counts))
+        place = window.best(evidence)
+        number = self._number(window, place)
+        excess = self._excess(counts, number)
+        right, _ = window.right(evidence / excess[:, None], place)
         offset, sd = self._between(counts, window, place, number)
         return window.column(place) + offset, np.minimum(sd * np.sqrt(excess), QUANTISED_SD), right
+
+    def _number(self, window: Window, place: Int64) -> Int64:
+        """Number (width,) of the words of the candidates at a place."""
+        return np.mod(window.columns[np.arange(len(place)), place], len(self.book.words))
+
+    def _evidence(self, counts: NDArray[np.uint32]) -> Float64:
+        """The logarithm of L (width, numbers) for the counts of one row (width, patterns)."""
+        words, frames = self.book.words, self.frames * self.book.words.shape[1]
+        lit_frames = words.sum(axis=1, dtype=np.int64) * self.frames
+        total = counts.sum(axis=1, dtype=np.int64)[:, None]
+        return log_evidence(_in_lit(counts, words), lit_frames, frames, total, log_factorials(frames + 1))
 
     def _between(
         self, counts: NDArray[np.uint32], window: Window, place: Int64, number: Int64
@@ -261,26 +271,28 @@ class Decoder:
         sd = np.where(fall > 0, 0.5 * noise / np.where(fall > 0, fall, 1.0), QUANTISED_SD)
         return peak_offset(before, at, after), sd
 
+    def _excess(self, counts: NDArray[np.uint32], number: Int64) -> Float64:
+        """Pearson's chi-square per degree of freedom, at least 1, of one row's counts (width, patterns) around the two
+        levels that the pixels' words tell. Repetitions of a pattern are added up: haze is the same in all of them."""
+        first, repetition, times = np.unique(
+            self.book.same, return_index=True, return_inverse=True, return_counts=True
+        )[1:]
+        added = counts.astype(np.float32) @ np.eye(len(times), dtype=np.float32)[repetition]
+        lit = self.book.words[number][:, first].astype(np.float64)
+        excess = np.zeros(len(counts))
+        for group in (lit, 1.0 - lit):
+            rate = (group * added).sum(axis=1) / np.maximum(group @ (times * self.frames), 1.0)
+            expected = rate[:, None] * times * self.frames
+            variance = expected * (1.0 - rate[:, None])
+            squares = group * (added - expected) ** 2
+            excess += np.where(variance > 0, squares / np.where(variance > 0, variance, 1.0), 0.0).sum(axis=1)
+        result: Float64 = np.maximum(excess / max(len(times) - 2, 1), 1.0)
+        return result
+
 
 def _in_lit(counts: NDArray[np.uint32], words: Uint8) -> Int64:
     """Counts (width, numbers) in the patterns that each word lights. Whole numbers below 2^24 are exact in float32."""
     return np.rint(counts.astype(np.float32) @ words.T.astype(np.float32)).astype(np.int64)
-
-
-def _excess(counts: NDArray[np.uint32], words: Uint8, frames: int) -> Float64:
-    """Pearson's chi-square per degree of freedom, at least 1, of one row's counts (width, patterns) around the two
-    levels that the pixels' words (width, patterns) tell."""
-    lit = words.astype(np.float64)
-    dark = 1.0 - lit
-    excess = np.zeros(len(counts))
-    for group in (lit, dark):
-        size = np.maximum(group.sum(axis=1), 1.0)
-        mean = (group * counts).sum(axis=1) / size
-        variance = mean * (1.0 - mean / frames)
-        squares = (group * (counts - mean[:, None]) ** 2).sum(axis=1)
-        excess += np.where(variance > 0, squares / np.where(variance > 0, variance, 1.0), 0.0)
-    result: Float64 = np.maximum(excess / max(words.shape[1] - 2, 1), 1.0)
-    return result
 
 
 @dataclass(frozen=True, slots=True)

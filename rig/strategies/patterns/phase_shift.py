@@ -131,16 +131,19 @@ class PhaseShift:
         coarse = gray_code(bits, int(cells[-1]) + 1)[:, cells]
         patterns = np.concatenate([sines, coarse.astype(np.float32)])
         levels = measured(apparatus, self.camera, patterns, [1.0] * shifts + [shifts / bits] * bits, budget)
-        middle, amplitude = levels.light[:shifts].mean(axis=0), phase_of(levels.take(slice(shifts)))[2]
-        expected = np.concatenate([
-            fitted_sines(levels.take(slice(shifts))),
-            middle + np.where(levels.light[shifts:] > middle, amplitude, -amplitude),
-        ])  # fmt: skip
-        levels, excess = with_noise(levels, self.camera, expected, 3)
+        middle = levels.light[:shifts].mean(axis=0)
+        contrast = levels.light[shifts:] - middle
+        size = np.abs(contrast)
+        # At the border of a cell one bit lies between lit and dark, as it should.
+        border = size == size.min(axis=0)
+        usual = np.where(border, 0.0, size).sum(axis=0) / max(bits - 1, 1)
+        expected = middle + np.where(border, contrast, np.sign(contrast) * usual)
+        expected = np.concatenate([fitted_sines(levels.take(slice(shifts))), expected])
+        levels, excess = with_noise(levels, self.camera, expected, 5 if bits > 2 else 3)
         turns, sd, _ = phase_of(levels.take(slice(shifts)))
         of_middle = levels.variance[:shifts].sum(axis=0) / shifts**2
         spread = np.sqrt((levels.variance[shifts:] + of_middle) * excess)
-        cell, right = gross_errors(levels.light[shifts:] - middle, spread, gray=True)
+        cell, right = gross_errors(contrast, spread, gray=True)
         centre = cell * half
         number = period * (turns + np.rint(centre / period - turns))
         column = unwrapped(geometry, number, half * 2**bits)
@@ -248,7 +251,7 @@ class MicroPhaseShift:
             window = Window(geometry, row, infinite)
             match = np.maximum(*(window.of(centred[:, row].T @ code) for code in codes))
             fit = 0.5 * np.maximum(match, 0.0) ** 2 / noise[row, :, None]
-            right[row] = window.right(fit, window.best(match))
+            right[row], _ = window.right(fit, window.best(match))
         sd = np.sqrt(noise / np.maximum(sharpness, 1e-12 * noise))
         return answer_of(geometry, column, sd, np.where(levels.clipped, 0.0, right))
 

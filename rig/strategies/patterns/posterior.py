@@ -54,13 +54,19 @@ class Window:
         before, after = score[pixel, np.maximum(place - 1, 0)], score[pixel, np.minimum(place + 1, most)]
         return np.minimum(before, at), at, np.minimum(after, at)
 
-    def right(self, log_likelihood: Float64, place: NDArray[np.int64]) -> Float64:
-        """Probability (width,) that the column is the one at a place, or one within a column or the tolerance of it."""
+    def right(self, log_likelihood: Float64, place: NDArray[np.int64]) -> tuple[Float64, Float64]:
+        """Probability (width,) that the column is the one at a place, or one within a column or the tolerance of it.
+
+        Also the root mean square distance (width,) of these columns from the place, weighted by their probability.
+        """
         seen = np.where(self.feasible, log_likelihood, -np.inf)
         peak = seen.max(axis=1, keepdims=True)
         weight = np.exp(seen - np.where(np.isfinite(peak), peak, 0.0))
         allowed = np.maximum(GOOD * np.abs(self.low + place - self._infinite), 1.0)
-        near = np.abs(np.arange(seen.shape[1]) - place[:, None]) <= np.nan_to_num(allowed, nan=1.0)[:, None]
+        away = np.abs(np.arange(seen.shape[1]) - place[:, None])
         total = weight.sum(axis=1)
-        share: Float64 = (weight * near).sum(axis=1) / np.where(total > 0, total, 1.0)
-        return share
+        weight = np.where(away <= np.nan_to_num(allowed, nan=1.0)[:, None], weight, 0.0)
+        near = weight.sum(axis=1)
+        spread: Float64 = np.sqrt((weight * away**2).sum(axis=1) / np.where(near > 0, near, 1.0))
+        share: Float64 = near / np.where(total > 0, total, 1.0)
+        return share, spread
