@@ -3,6 +3,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 # As `rig` does itself: threads of numpy's linear algebra only get into each other's way.
 export OPENBLAS_NUM_THREADS ?= 1
+# Images of containers often set it. Then each of the hundreds of processes that tests start compiles all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo help install test checks kernels lint types layers house docs figures unit clean
 .PHONY: packages pythons accuracy accuracy-rows accuracy-joint accuracy-calibration
@@ -18,10 +20,10 @@ install: .venv/.installed-tests  ## set up .venv with everything that tests need
 help:  ## this list
 	@awk -F' *## ' '/^[a-z-]+:.*## / { sub(/:.*/, "", $$1); printf "%-21s %s\n", $$1, $$2 }' Makefile
 
-# The kernels are compiled once, while one core checks types: four workers that start cold would each compile them.
+# The kernels are compiled once, by one core, while the other makes all else: four workers that start cold would each
+# compile them. The kernels come first, since they take longest.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
-	$(MAKE) --jobs=2 --output-sync=target checks kernels
-	$(MAKE) docs NOTEBOOKS=off SITE=docs/_build/check
+	$(MAKE) --jobs=2 --output-sync=target kernels checks docs NOTEBOOKS=off SITE=docs/_build/check
 	$(PYTEST) --durations=25
 
 checks: lint types layers house
@@ -46,7 +48,7 @@ figures: .venv/.installed-tests  ## draw the figures of docs/figures/ anew
 	$(BIN)/python -m docs.generate.figures
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
-PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile
+PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 unit: .venv/.installed-tests  ## the quick tests of single modules, for while you develop (90 s)
 	$(PYTEST) -m "not slow" tests/unit
 
