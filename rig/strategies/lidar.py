@@ -40,8 +40,6 @@ NEIGHBOURS: Final = 8
 """Pixels to either side whose first photons say whether a pixel's own came from a surface."""
 NEAR_SIGMAS, AROUND_SIGMAS = 3.0, 15.0
 """Photons of one surface differ by sqrt(2) standard deviations of the pulse; light of fog is spread over many."""
-CHANCE: Final = NEAR_SIGMAS / (AROUND_SIGMAS - NEAR_SIGMAS)
-"""Photons that come with another by chance, over those around it."""
 
 Method = Literal["first-photon", "peak", "gamma"]
 
@@ -97,9 +95,14 @@ def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) ->
         [np.sum(np.cumsum(row, axis=-1) <= d[:, None], axis=-1) for row, d in zip(seen.counts, drawn, strict=True)]
     )
     time_s = np.where(total > 0, seen.start_s + seen.bin_s * (at + 0.5), np.nan)
+    start_s, end_s = seen.start_s, seen.start_s + seen.bin_s * seen.counts.shape[-1]
+    near_s, far_s = (
+        np.clip(time_s - start_s, 0, sigmas * sigma_s) + np.clip(end_s - time_s, 0, sigmas * sigma_s)
+        for sigmas in (NEAR_SIGMAS, AROUND_SIGMAS)
+    )
+    by_chance = np.nan_to_num(near_s / np.maximum(far_s - near_s, 1e-3 * sigma_s))
     with_it, around, others = (np.zeros(time_s.shape) for _ in range(3))
-    next_to_it = np.zeros(2)
-    width = time_s.shape[1]
+    together, width = 0.0, time_s.shape[1]
     for offset in range(1, min(NEIGHBOURS, width - 1) + 1):
         apart = np.abs(time_s[:, offset:] - time_s[:, :-offset])
         near, far = apart < NEAR_SIGMAS * sigma_s, apart < AROUND_SIGMAS * sigma_s
@@ -108,11 +111,13 @@ def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) ->
             around[:, part] += far & ~near
             others[:, part] += np.isfinite(apart)
         if offset == 1:
-            next_to_it = np.array([np.sum(near) - np.sum(far & ~near) * CHANCE, np.sum(np.isfinite(apart))])
+            together = float(np.sum(with_it - around * by_chance) / max(np.sum(others), 1.0))
     # Two neighbours come together where both came from a surface.
-    share = math.sqrt(min(max(next_to_it[0] / max(next_to_it[1], 1.0), 1e-12), 1 - 1e-6))
-    chance = (around + 0.5) * CHANCE
-    more = np.clip(with_it - chance, 1e-9, np.maximum(others * share, 1e-9))
+    share = math.sqrt(min(max(together, 1e-12), 1 - 1e-6))
+    chance = np.maximum((around + 0.5) * by_chance, 1e-9)
+    # Of the neighbours on the same surface a quarter come with it even where the surface is steep.
+    most = np.maximum(others * share, 1e-9)
+    more = np.clip(with_it - chance, 0.25 * most, most)
     odds = math.log(share / (1 - share)) + with_it * np.log1p(more / chance) - more
     seen_at_all = np.isfinite(time_s)
     believed = np.where(seen_at_all, _logistic(odds), 0.0)

@@ -73,7 +73,7 @@ def rectified(model: RigModel) -> Rectified:
     if not np.any(camera.distortion) and np.hypot(second[1], second[2]) <= ALIGNED * abs(second[0]):
         return Rectified(float(second[0] * camera.matrix[0, 0]), None, np.eye(3), camera.matrix)
     size, lens = (camera.width, camera.height), (camera.matrix, camera.distortion)
-    turned = cv2.stereoRectify(*lens, *lens, size, np.eye(3), -np.asarray(second), alpha=-1)
+    turned = cv2.stereoRectify(*lens, *lens, size, np.eye(3), -np.asarray(second, np.float64)[:, None], alpha=-1)
     maps = tuple(
         cv2.initUndistortRectifyMap(*lens, turn, matrix[:, :3], size, cv2.CV_32FC1)
         for turn, matrix in ((turned[0], turned[2]), (turned[1], turned[3]))

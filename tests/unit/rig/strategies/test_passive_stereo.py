@@ -1,0 +1,96 @@
+"""Passive stereo on planes: the known error of depth, the matcher's bias, rigs that must be rectified first."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.model.camera import Camera
+from calibration.model.rig_model import RigModel
+from calibration.model.scanner import PivotScanner
+from rig.errors import UsageError
+from rig.strategies import passive_stereo
+from rig.strategies.apparatus import Budget
+from rig.strategies.passive_stereo import depth_of_pair, rectified
+from rig.strategies.strategy import ColumnGeometry, TooShort
+from tests.stability.inventory import covers
+from tests.unit.rig.strategies.plane_scene import PlaneScene
+
+covers(depth_of_pair, rectified)
+SGBM = passive_stereo.SGBM
+
+
+@pytest.mark.parametrize("inverse", [0.2, 0.31, 0.45])
+def test_depth_errs_by_z_squared_over_bf_times_the_disparity(inverse) -> None:
+    scene = PlaneScene(inverse=inverse, lit=5e5, read_noise=60.0)
+    answer = SGBM.measure(scene, scene.geometry, Budget(0.0015), 0)
+    disparity = scene.geometry.px_per_inverse_depth * (1 / answer.depth_m - 1 / scene.depth_m)
+    good = np.abs(disparity) < 1
+    assert good.mean() > 1 - 1.2 * 90 * inverse / 200  # what the second camera does not see is on the left
+    dz = (answer.depth_m - scene.depth_m)[good]
+    assert dz.std() == pytest.approx(disparity[good].std() / inverse**2 / (0.3 * 300), rel=0.05)
+    assert abs(disparity[good].mean()) < 0.06
+
+
+def test_a_slanted_plane_is_found_and_what_is_believed_is_right() -> None:
+    scene = PlaneScene(inverse=0.35, tilt=0.2, lit=5e5, read_noise=10.0)
+    answer = SGBM.measure(scene, scene.geometry, Budget(0.0015), 0)
+    right = np.abs(answer.depth_m / scene.depth_m - 1) < 0.02
+    sure = answer.confidence >= 0.9
+    assert sure.mean() > 0.6
+    assert np.mean(right[sure]) > 0.97
+
+
+@pytest.mark.parametrize("light", [{"lit": 0.0, "ambient": 1e5}, {"lit": 0.0}, {"lit": 1e3, "haze": 1e8}])
+def test_without_contrast_nothing_is_believed(light) -> None:
+    scene = PlaneScene(read_noise=7.0, width=160, **light)
+    answer = SGBM.measure(scene, scene.geometry, Budget(0.003), 0)
+    assert np.mean(answer.confidence >= 0.9) < 0.005
+
+
+def painted(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Brightness of a textured plane."""
+    waves = np.random.default_rng(5)
+    total = np.zeros(x_m.shape)
+    for _ in range(30):
+        across, down, phase = waves.uniform(-90, 90), waves.uniform(-90, 90), waves.uniform(0, 2 * math.pi)
+        total += np.sin(across * x_m + down * y_m + phase)
+    return 2000 + 300 * total / math.sqrt(15)
+
+
+@pytest.mark.parametrize(
+    ("source_m", "distortion"),
+    [((-0.2, 0.02, 0.01), (0.0,) * 5), ((0.2, -0.02, 0.0), (-0.2, 0.05, 0.0, 0.0, 0.0)), ((0.2, 0.0, 0.0), (0.0,) * 5)],
+)
+def test_cameras_that_do_not_stand_side_by_side_are_rectified(source_m, distortion) -> None:
+    width, height, depth_m = 200, 90, 2.5
+    camera = Camera(width, height, np.array([[250.0, 0, 99.5], [0, 250.0, 44.5], [0, 0, 1]]), np.array(distortion))
+    scanner = PivotScanner(np.array(source_m), np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0.0, 0.5]))
+    model = RigModel(camera, scanner, source_m=np.array(source_m))
+    geometry = ColumnGeometry(model, np.linspace(-0.9, 0.9, 100), (1.0, 8.0), np.arange(height))
+    u, v = camera.tangents()
+    pair = []
+    for x, y, z in ((0.0, 0.0, 0.0), source_m):
+        reach = depth_m - z
+        pair.append(painted(x + u * reach, y + v * reach))
+    answer = depth_of_pair(np.array(pair, np.float32), geometry)
+    inner = answer.depth_m[12:-12, 25:-25]
+    assert np.isfinite(inner).mean() > 0.75
+    assert np.nanmedian(np.abs(inner / depth_m - 1)) < 0.01
+    assert (rectified(model).maps is None) == (not any(distortion) and source_m[1:] == (0.0, 0.0))
+
+
+def test_a_source_above_the_camera_is_refused() -> None:
+    scene = PlaneScene(rows_number=12, width=100)
+    model = replace(scene.geometry.model, source_m=np.array([0.1, 0.3, 0.0]))
+    with pytest.raises(UsageError, match="left or right of the camera"):
+        rectified(model)
+
+
+def test_the_time_is_kept() -> None:
+    scene = PlaneScene(rows_number=12, width=100, lit=1e6)
+    SGBM.measure(scene, scene.geometry, Budget(0.0205), 0)
+    assert 0.02 < scene.spent.time_s <= 0.0205 * (1 + 1e-6)
+    with pytest.raises(TooShort, match="one exposure"):
+        SGBM.measure(scene, scene.geometry, Budget(0.9e-3), 0)
