@@ -97,6 +97,25 @@ def shapes(lobes: Lobes, share: float, baseline: float) -> tuple[Array, Array, A
     return halo, row[:, : -PLACES - 1 : -1], row[:, :PLACES]
 
 
+def totals(lobes: Lobes, share: float, reach: float) -> tuple[Array, Array]:
+    """All light scattered more than once where everything within an angle is lit, (depths,) each: that of the surface
+    (surface = 1), and of the haze from this depth (haze scattered once = 1).
+
+    These are sums of the bands of `shapes`, since every line of a lit surface sends its band to all others. reach:
+    tangent of the half angle that is lit.
+    """
+    mean_cosine, places = sum(w * g for w, g in lobes), round(reach / STEP)
+    reduced, isotropic = (share * DEPTHS * (1 - mean_cosine)) ** 2, (share * DEPTHS) ** 2
+
+    def total(of: Lobes, haze: bool) -> Array:
+        return np.asarray(2 * STEP * scattered_once(of, share, haze)[:, :places].sum(axis=1))
+
+    surface = np.expm1(2 * total(lobes, False)) * (1 + HALO_GROWTH * reduced)
+    thrown_back = total(((1.0, 0.0),), False) * (1 + HALO_GROWTH * isotropic)
+    haze = np.expm1(2 * total(lobes, True)) * (1 + HAZE_GROWTH * reduced)
+    return surface + ALBEDO * math.sqrt(1 - mean_cosine) * thrown_back, haze
+
+
 _HALF_A_STEP = np.pi * np.arange(2 * PLACES + 1) / (4 * PLACES)
 """Phases by which a row, sampled in the middle of steps, is half a step off."""
 

@@ -36,6 +36,8 @@ MOST_POWER_W = 1e6
 SPOTS_AT_ONCE = 4096
 DARK = "dark counts"
 """Name of the effect that only the SPAD has, of those without the source."""
+MULTIPLE = "halo"
+"""Name of the effect that is light scattered more than once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,7 @@ class SimulatedApparatus:
         self._electrons /= setting.sensor.detection_probability * setting.sensor.fill_factor
         light = [rate[rows] for name, rate in flux.steady.items() if name != DARK]
         self._light_per_s = sum(light, np.zeros_like(transport.steady_per_s))
-        self._setting = setting
+        self._setting, self._multiple = setting, MULTIPLE in flux.laser
         self._rows_of_fan = rows_of_fan(setting)[rows]
         self._rng = np.random.default_rng(request.seed)
         self._time_s = self._energy_j = 0.0
@@ -191,7 +193,7 @@ class SimulatedApparatus:
         """
         (number,) = _frames(np.array([pulses]), 1).tolist()
         power_w = self._request.power_w * (2 if self._request.rule == "irradiance" else 1)
-        back = echoes(self._setting, self.rows, self._transport.steady_per_s)
+        back = echoes(self._setting, self.rows, self._transport.steady_per_s, self._multiple)
         opened = gate(self._hardware.pulses, self._request.depth_range_m, back.stretch, bin_s)
         counts = first_photons(self._rng, back, opened, number, power_w * self.spad_frame_s, self._bits)
         self._spend(np.array([number * self.spad_frame_s]), np.array([power_w]))

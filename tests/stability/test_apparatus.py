@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim_backend.effects.beam_spread import DEPTHS
 from sim_backend.light.optics import LIGHT_M_PER_S
 from sim_backend.projector import draws, pulse, stereo, transport
 from sim_backend.projector.apparatus import SimulatedApparatus, rows_of_fan
 from sim_backend.projector.draws import count, inverted, next_wait, readings
 from sim_backend.projector.hardware import ConventionalCamera, PulsedSource
-from sim_backend.projector.pulse import Gate, blur_s, expected, gate
+from sim_backend.projector.pulse import LEAST_RANGE_M, FogEcho, Gate, blur_s, expected, gate
 from sim_backend.projector.stereo import ambient_radiance, first_view, second_view
 from sim_backend.projector.transport import blocks, checked_columns, checked_rows, runs
 from tests.stability.inventory import EXAMPLES, covers
@@ -60,20 +61,33 @@ def test_readings_stay_within_the_range(
 @covers(expected, pulse)
 @EXAMPLES
 @given(
-    st.floats(1e-3, 1e12) | st.just(np.inf), st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0, 1e6),
-    st.floats(1e-13, 1e-6), st.floats(1e-13, 1e-7),
+    st.floats(1e-3, 1e12) | st.just(np.inf), st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0, 1e9),
+    st.floats(1e-13, 1e-6), st.floats(1e-13, 1e-7), st.integers(1, 4),
 )  # fmt: skip
 def test_echoes_are_finite_and_add_up(
-    range_m: float, surface: float, medium: float, extinction_per_m: float, bin_s: float, sigma_s: float
+    range_m: float, surface: float, fog: float, detour_m: float, bin_s: float, sigma_s: float, parts: int
 ) -> None:
-    mean = np.full(50, np.nan)
-    start_s = 2 * 0.5 / LIGHT_M_PER_S
-    expected((start_s, bin_s, sigma_s), surface, range_m, 1e3, medium, extinction_per_m, mean)
+    mean, of_fog = np.full(50, np.nan), np.full((50, parts), fog)
+    expected((3e-9, bin_s, sigma_s), np.array([surface, 2 * surface, range_m, detour_m, 1e3]), of_fog, mean)
     assert np.isfinite(mean).all()
     assert (mean >= 1e3 * bin_s * (1 - 1e-9)).all()
-    at_m = 0.5 * LIGHT_M_PER_S * start_s
-    most = surface + medium * math.exp(-2 * extinction_per_m * at_m) / at_m + 50 * 1e3 * bin_s
-    assert mean.sum() <= most * (1 + 1e-6)
+    assert mean.sum() <= (3 * surface + of_fog.sum() + 50 * 1e3 * bin_s) * (1 + 1e-6)
+
+
+@covers(FogEcho)
+@EXAMPLES
+@given(st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0, 1e-6), st.floats(1e-12, 1e-7))
+def test_the_fog_sends_back_no_more_than_without_extinction(
+    per_j: float, extinction_per_m: float, start_s: float, bin_s: float
+) -> None:
+    none = np.zeros(len(DEPTHS))
+    opened = Gate(start_s, bin_s, 20, 1e-10)
+    once = FogEcho(per_j, extinction_per_m, DEPTHS, none).within(opened)
+    more = FogEcho(per_j, extinction_per_m, DEPTHS, none + 1.0).within(opened)
+    assert np.isfinite(more).all()
+    assert (once >= 0).all()
+    assert (once <= more).all()
+    assert once.sum() <= per_j / LEAST_RANGE_M * (1 + 1e-9)
 
 
 @covers(gate, blur_s)

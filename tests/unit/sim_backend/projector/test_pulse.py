@@ -1,6 +1,7 @@
 """Pulses against the lidar equation in closed form, and first photons against their distribution."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from sim_backend.projector.hardware import PulsedSource
 from sim_backend.projector.pulse import Echoes, Gate, echoes, expected, first_photons, gate, solid_angle_sr, time_first
 from sim_backend.scenes.medium import Rain, Snow
 from tests.stability.inventory import covers
+from tests.unit.sim_backend.projector import traced_pulses
 from tests.unit.sim_backend.rigs import pixel_solid_angle, rig, setting, wall
 
 covers(pulse)
@@ -21,11 +23,11 @@ covers(pulse)
 WALL_M, FOG = 4.0, {"medium": {"fog": {"visibility": "12 m"}}}
 
 
-def mean_of(back: Echoes, opened: Gate, at: tuple[int, int], pulse_j: float = 1.0) -> np.ndarray:
+def mean_of(back: Echoes, opened: Gate, at: tuple[int, int]) -> np.ndarray:
     mean = np.zeros(opened.bins)
+    light = (back.surface_per_j, back.late_per_j, back.range_m, back.detour_m, back.steady_per_s)
     times = opened.start_s, opened.bin_s, opened.sigma_s
-    light = pulse_j * back.surface_per_j[at], back.range_m[at], back.steady_per_s[at]
-    expected(times, *light, pulse_j * back.medium_m_per_j, back.extinction_per_m, mean)
+    expected(times, np.array([part[at] for part in light]), back.fog.within(opened), mean)
     return mean
 
 
@@ -34,7 +36,7 @@ def made(scene: dict[str, object], bin_s: float = 2e-10, tilt: float = 0.3):
     normal = (math.sin(tilt), 0.0, math.cos(tilt))
     setup = setting(model, wall(model, normal, WALL_M, 0.4), **scene)
     rows = np.array([5, 32])
-    back = echoes(setup, rows, np.zeros((2, 96)))
+    back = echoes(setup, rows, np.zeros((2, 96)), False)
     return model, setup, back, gate(PulsedSource(), (1.0, 8.0), back.stretch, bin_s)
 
 
@@ -55,9 +57,7 @@ def test_a_wall_sends_back_what_the_lidar_equation_says() -> None:
             assert back.surface_per_j[y, x] == pytest.approx(light, rel=2e-3)
             mean = mean_of(back, opened, (y, x))
             places = opened.start_s + (np.arange(opened.bins) + 0.5) * opened.bin_s
-            echo = mean_of(
-                Echoes(back.range_m, back.surface_per_j, 0.0, 0.0, back.steady_per_s, (1, 1)), opened, (y, x)
-            )
+            echo = mean_of(replace(back, fog=replace(back.fog, per_j=0.0)), opened, (y, x))
             assert echo.sum() == pytest.approx(light, rel=2e-3)
             assert echo @ places / echo.sum() == pytest.approx(2 * range_m / LIGHT_M_PER_S, abs=1e-14)
             sd_s = math.hypot(500e-12, 100e-12) / 2.3548
@@ -70,8 +70,7 @@ def test_a_wall_sends_back_what_the_lidar_equation_says() -> None:
 def test_fog_sends_back_the_lidar_equations_integral_up_to_the_wall(bin_s: float) -> None:
     _, setup, back, opened = made(FOG, bin_s)
     at = (1, 50)
-    fog = mean_of(Echoes(back.range_m, 0 * back.surface_per_j, back.medium_m_per_j, back.extinction_per_m,
-                         back.steady_per_s, (1, 1)), opened, at)  # fmt: skip
+    fog = mean_of(replace(back, surface_per_j=0 * back.surface_per_j), opened, at)
     sigma, first_m = 3.912 / 12, LIGHT_M_PER_S * opened.start_s / 2
     r = np.linspace(first_m, back.range_m[at], 200_001)
     light = setup.gain * sigma * 0.05 / solid_angle_sr(setup) * np.exp(-2 * sigma * r) / r**2
@@ -109,7 +108,8 @@ def test_first_photons_of_many_pixels_have_the_multinomial_distribution() -> Non
 
 def test_ambient_light_comes_evenly_and_open_sky_sends_nothing_back() -> None:
     _, setup, back, opened = made({})
-    sky = Echoes(np.full((2, 96), np.inf), np.zeros((2, 96)), 0.0, 0.0, np.full((2, 96), 3e6), back.stretch)
+    none = np.zeros((2, 96))
+    sky = replace(back, range_m=np.full((2, 96), np.inf), surface_per_j=none, late_per_j=none, steady_per_s=none + 3e6)
     bits = SensorBits(FluxModel(setup), np.array([5, 32]), 1e-5)
     counts = first_photons(np.random.default_rng(1), sky, opened, 2000, 1e-6, bits)
     before = np.exp(-3e6 * opened.bin_s * np.arange(opened.bins))
@@ -124,7 +124,7 @@ def test_dead_pixels_time_nothing_and_hot_ones_fire_at_once() -> None:
     setup = setting(model, wall(model, (0, 0, 1.0), WALL_M), sensor=sensor)
     rows = np.array([5, 32])
     bits = SensorBits(FluxModel(setup), rows, 1e-5)
-    back = echoes(setup, rows, np.zeros((2, 96)))
+    back = echoes(setup, rows, np.zeros((2, 96)), True)
     counts = first_photons(
         np.random.default_rng(1), back, gate(PulsedSource(), (1.0, 8.0), back.stretch, 1e-9), 50, 1e-6, bits
     )
@@ -151,3 +151,45 @@ def test_the_gate_covers_the_depth_range_in_all_pixels() -> None:
     end_s = opened.start_s + opened.bins * opened.bin_s
     assert 24 / LIGHT_M_PER_S + 4 * opened.sigma_s <= end_s < 24 / LIGHT_M_PER_S + 4 * opened.sigma_s + 1e-10
     assert gate(PulsedSource(), (1e-3, 10.0), (1.0, 1.2), 1e-10).start_s == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("depth", "phase", "of_fog"),
+    [
+        (0.25, None, 0.1), (0.5, None, 0.1), (1.0, None, 0.15), (2.0, None, 0.25), (0.5, {"g": 0.85}, 0.25),
+        (1.0, {"g": 0.6}, 0.2), (0.5, "isotropic", 0.1), (1.0, "isotropic", 0.1),
+    ],
+)  # fmt: skip
+def test_light_scattered_more_than_once_is_about_that_of_traced_pulses(
+    depth: float, phase: object, of_fog: float
+) -> None:
+    wall_m, reach, albedo, step_m = 5.0, 0.43, 0.5, 0.05
+    model = rig(size=(95, 95), focal_px=47.0 / reach)
+    medium = {"extinction": f"{depth / wall_m} /m"} | ({} if phase is None else {"phase": phase})
+    setup = setting(model, wall(model, (0.0, 0.0, 1.0), wall_m, albedo), medium=medium)
+    back = echoes(setup, np.array([47]), np.zeros((1, 95)), True)
+    assert setup.scene.medium is not None
+    light, lobes = np.zeros((4, 300)), np.array(setup.scene.medium.lobes)
+    rng = np.random.default_rng(3)
+    traced_pulses.trace(rng, 600_000, (wall_m, depth / wall_m, albedo, reach), lobes, light, step_m)
+    once_fog, once_wall, more_wall, more_fog = light
+    factor = 1 + back.late_per_j[0, 47] / back.surface_per_j[0, 47]
+    assert factor == pytest.approx(1 + more_wall.sum() / once_wall.sum(), rel=0.12)
+    opened = Gate(2 * 2.5 / LIGHT_M_PER_S, 2 / LIGHT_M_PER_S, 1, 1e-12)
+    fog = back.fog.within(opened).sum() / replace(back.fog, more=0 * back.fog.more).within(opened).sum()
+    there = slice(int(2.5 / step_m), int(3.5 / step_m))
+    assert fog == pytest.approx(1 + more_fog[there].sum() / once_fog[there].sum(), rel=of_fog)
+    ends_m, within_m = step_m * np.arange(1, 301), np.array([0.1, 0.3])
+    late = np.interp(wall_m + within_m, ends_m, np.cumsum(more_wall) / more_wall.sum())
+    np.testing.assert_allclose(-np.expm1(-within_m / back.detour_m[0, 47]), late, atol=0.12)
+
+
+def test_a_detour_delays_light_by_its_mean_and_loses_none() -> None:
+    opened, times = Gate(2e-8, 1e-10, 2000, 3e-10), (2e-8, 1e-10, 3e-10)
+    places_m = 0.5 * LIGHT_M_PER_S * (2e-8 + 1e-10 * (np.arange(2000) + 0.5))
+    for detour_m in (0.0, 1e-3, 0.006, 0.05, 0.6):
+        mean = np.zeros(opened.bins)
+        expected(times, np.array([1e-9, 1.0, 5.0, detour_m, 0.0]), np.zeros((2000, 1)), mean)
+        assert mean.sum() == pytest.approx(1, abs=1e-6)
+        assert mean @ places_m == pytest.approx(5 + detour_m, abs=1e-4 + 2e-3 * detour_m)
