@@ -55,8 +55,10 @@ SHORTEST = 4.0
 """Blur over mean detour above which all detours are taken to be alike."""
 PART_M = 0.1
 """Length of the parts of a bin over which the medium's light is summed."""
+LONGEST_DETOURS = 30.0
+"""Mean detours after which all of a surface's light has arrived."""
 FAR_SIGMAS = 10.0
-"""Standard deviations of the blur before a surface where the medium is whole."""
+"""Standard deviations of the blur beside a surface within which it counts."""
 LEAST_RANGE_M = 1e-3
 """Distance from which on the medium sends light back; keeps 1/r^2 finite."""
 
@@ -229,23 +231,27 @@ def expected(times: tuple[float, float, float], echo: Array, fog: Array, mean: A
     start_s, bin_s, sigma_s = times
     surface, late, range_m, detour_m, steady_per_s = echo
     per_s = 0.5 * LIGHT_M_PER_S
-    sigma_m = per_s * sigma_s
-    step_m = per_s * bin_s / fog.shape[1]
-    place_m = per_s * start_s - range_m
-    prompt, delayed, lit = edge(place_m / sigma_m), _arrived(place_m, sigma_m, detour_m), edge_sum(-place_m / sigma_m)
+    sigma_m, blur_m = per_s * sigma_s, FAR_SIGMAS * per_s * sigma_s
+    parts = fog.shape[1]
+    step_m = per_s * bin_s / parts
     for i in range(len(mean)):
         mean[i] = steady_per_s * bin_s
-        for part in range(fog.shape[1]):
-            place_m = per_s * start_s + (i * fog.shape[1] + part + 1) * step_m - range_m
-            # Share of the part that lies before the surface, whose edge is blurred.
-            lit_before, lit = lit, edge_sum(-place_m / sigma_m)
-            share = sigma_m * (lit_before - lit) / step_m if place_m > -FAR_SIGMAS * sigma_m else 1.0
-            mean[i] += min(max(share, 0.0), 1.0) * fog[i, part]
-        if surface > 0.0 and place_m > -FAR_SIGMAS * sigma_m:
-            before, prompt = prompt, edge(place_m / sigma_m)
-            mean[i] += surface * (prompt - before)
-            before, delayed = delayed, _arrived(place_m, sigma_m, detour_m)
-            mean[i] += late * max(delayed - before, 0.0)
+        near_m = per_s * (start_s + i * bin_s) - range_m
+        far_m = near_m + parts * step_m
+        for part in range(parts):
+            place_m = near_m + part * step_m
+            share = 1.0
+            if place_m > blur_m:
+                break
+            if place_m + step_m > -blur_m:
+                # Share of the part that lies before the surface, whose edge is blurred.
+                lit = edge_sum(-place_m / sigma_m) - edge_sum(-(place_m + step_m) / sigma_m)
+                share = min(max(sigma_m * lit / step_m, 0.0), 1.0)
+            mean[i] += share * fog[i, part]
+        if surface > 0.0 and -blur_m < far_m and near_m < blur_m + LONGEST_DETOURS * detour_m:
+            mean[i] += surface * (edge(far_m / sigma_m) - edge(near_m / sigma_m))
+            delayed = _arrived(far_m, sigma_m, detour_m) - _arrived(near_m, sigma_m, detour_m)
+            mean[i] += late * max(delayed, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)

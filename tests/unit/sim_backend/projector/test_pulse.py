@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim_backend.effects.beam_spread import PLACES, STEP, shapes, totals
 from sim_backend.effects.particles import make_particles
 from sim_backend.frames.flux import FluxModel
 from sim_backend.light.optics import LIGHT_M_PER_S, Sensor
@@ -183,6 +184,17 @@ def test_light_scattered_more_than_once_is_about_that_of_traced_pulses(
     ends_m, within_m = step_m * np.arange(1, 301), np.array([0.1, 0.3])
     late = np.interp(wall_m + within_m, ends_m, np.cumsum(more_wall) / more_wall.sum())
     np.testing.assert_allclose(-np.expm1(-within_m / back.detour_m[0, 47]), late, atol=0.12)
+
+
+@pytest.mark.parametrize("lobes", [((1.0, 0.0),), ((0.97, 0.9), (0.03, -0.7))])
+def test_the_light_of_all_lines_is_the_sum_of_a_lines_band(lobes: tuple[tuple[float, float], ...]) -> None:
+    of_surface, _ = totals(lobes, 0.9, STEP * PLACES)
+    band, _, _ = shapes(lobes, 0.9, 0.05)
+    np.testing.assert_allclose(of_surface, 2 * STEP * band.sum(axis=1), rtol=0.01)
+    narrow, narrow_fog = totals(lobes, 0.9, 0.2)
+    assert (narrow < of_surface).all()
+    assert (np.diff(narrow) > 0).all()
+    assert (narrow_fog > 0).all()
 
 
 def test_a_detour_delays_light_by_its_mean_and_loses_none() -> None:
