@@ -266,8 +266,13 @@ def _sure(top: Float32, second: Float32, noise: Float32, variance: Float32, cand
     return result
 
 
+CLEAR_PX: Final = {1: 0.2, 2: 0.5, 4: 1.5, 8: 8.0}
+"""Largest median error by number of lines: where search windows overlap, an answer may be another line's stripe."""
+
+
 def _spad(estimator: str, lines: int = 1) -> LineScan:
-    return LineScan(f"line-{estimator}" if lines == 1 else f"line-{lines}-{estimator}", estimator, lines)
+    name = f"line-{estimator}" if lines == 1 else f"line-{lines}-{estimator}"
+    return LineScan(name, estimator, lines, clear_px=CLEAR_PX[lines])
 
 
 ARGMAX, LIKELIHOOD, JOINT = _spad("argmax"), _spad("likelihood"), _spad("joint")
