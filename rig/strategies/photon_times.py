@@ -182,10 +182,10 @@ def without_pile_up(counts: Counts, pulses: int, corrected: Float64, share: Floa
         n = float(counts[i])
         corrected[i], share[i] = n, 1.0
         if pulses > 0:
-            share[i] = left / pulses
+            share[i] = max(left, 0.5) / pulses
             if n > 0.0:
-                # Where every pulse that was left put a photon into the bin, half a pulse stands for those that did not.
-                corrected[i] = -left * math.log(max(left - n, 0.5) / left)
+                # Half a pulse stands for none: where every pulse that was left put a photon into the bin, and after it.
+                corrected[i] = -left * math.log(max(left - n, 0.5) / max(left, 1.0))
                 left = max(left - n, 0.0)
 
 
