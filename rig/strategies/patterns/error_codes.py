@@ -277,7 +277,9 @@ class Decoder:
         first, repetition, times = np.unique(
             self.book.same, return_index=True, return_inverse=True, return_counts=True
         )[1:]
-        added = counts.astype(np.float32) @ np.eye(len(times), dtype=np.float32)[repetition]
+        added = counts.astype(np.float64)
+        if len(times) < added.shape[1]:
+            added = added @ np.eye(len(times))[repetition]
         lit = self.book.words[number][:, first].astype(np.float64)
         excess = np.zeros(len(counts))
         for group in (lit, 1.0 - lit):
