@@ -1,5 +1,6 @@
 """The commands that serve a run to others: `rig view` the page, `rig stream` the depth for other programs."""
 
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.command import Answer, Commands, asks, say
+from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.requests import StreamRequest, ViewRequest
 
@@ -26,17 +28,21 @@ def view_command(
     if live == (run is not None):
         what = "both a run and --live" if live else "neither a run nor --live"
         raise UsageError(f"rig view got {what}; name the folder of a run, or --live for the running scan")
-    from rig.view.viewer import view
-
     address: list[str] = []
+    waiting = ExitStack()
 
     def ready(url: str) -> None:
+        waiting.close()
         address.append(url)
         say(f"page: {url}")
         if "token=" in url:
             say("whoever has this address sees the scan and can stop it; Ctrl-C ends the page")
 
-    view(run, request, ready=ready)
+    with waiting:
+        waiting.enter_context(progress(compiles=False))
+        from rig.view.viewer import view
+
+        view(run, request, ready=ready)
     return Answer({"url": address[0]}, lambda: None)
 
 
