@@ -1,4 +1,4 @@
-"""What every strategy may use: light out, counts in.
+"""The interface between every strategy and its hardware: light out, counts in.
 
 An `Apparatus` is one camera in front of one scene, with one light source of a given power. A strategy chooses what is
 lit and for how long, and gets what the camera reads. It never learns of the scene, the medium or the noise. The
@@ -17,14 +17,14 @@ from drivers.interfaces import Spent as Spent
 from drivers.interfaces import World
 
 Rule = Literal["energy", "irradiance"]
-"""How light is shared. `energy`: every pattern has the whole power, spread over what it lights, so a line is brighter
-than a picture. `irradiance`: a lit column is equally bright however many are lit, namely as bright as the whole power
-spread over half of the columns."""
+"""Rule by which light is shared. `energy`: every pattern has the whole power, spread over what it lights, so a line is
+brighter than a picture. `irradiance`: a lit column is equally bright however many are lit, namely as bright as the
+whole power spread over half of the columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What a measurement may take. time_s: from the first exposure to the end of the last, all patterns together."""
+    """Limit of a measurement. time_s: from the first exposure to the end of the last, all patterns together."""
 
     time_s: float
 

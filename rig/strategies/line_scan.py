@@ -266,7 +266,7 @@ def _sure(top: Float32, second: Float32, noise: Float32, variance: Float32, cand
     return result
 
 
-CLEAR_PX: Final = {1: 0.2, 2: 0.5, 4: 1.5, 8: 8.0}
+CLEAR_PX: Final = {1: 0.2, 2: 1.5, 4: 1.5, 8: 8.0}
 """Largest median error by number of lines: where search windows overlap, an answer may be another line's stripe."""
 
 

@@ -140,11 +140,9 @@ def _matched(
     disparity, sure = (np.zeros(pair.shape[1:]) for _ in range(2))
     for part, kept in bands(rows):
         seen = np.ascontiguousarray(pair[:, part])
-        detail = np.stack([one - cv2.GaussianBlur(one, (0, 0), DETAIL_PX) for one in seen])
         first, second = seen
-        gain = 127 / (FULL_SIGMAS * max(float(np.std(detail)), 1e-6))
-        left_8, right_8 = np.clip(128 + gain * detail, 0, 255).astype(np.uint8)
-        found = _sgbm(left_8, right_8, least, number)
+        shown = detail_8_bits(seen)
+        found = matched_by_opencv(shown[0], shown[1], least, number)
         independent = independent_values(first, second)
         left, evidence = match(first, _shifted(second, least, number), independent)
         at = np.clip(np.rint(np.nan_to_num(found) - least), 0, number - 1).astype(np.int64)
@@ -159,8 +157,19 @@ def _matched(
     return disparity, sure
 
 
-def _sgbm(first: NDArray[np.uint8], second: NDArray[np.uint8], least: int, number: int) -> Float64:
-    """Disparity (rows, width) of the first picture by OpenCV's matcher, NaN where it finds none."""
+def detail_8_bits(pair: Float32) -> NDArray[np.uint8]:
+    """Two pictures (2, rows, width) without their local mean, stretched to 8 bits by one gain."""
+    detail = np.stack([one - cv2.GaussianBlur(one, (0, 0), DETAIL_PX) for one in pair])
+    gain = 127 / (FULL_SIGMAS * max(float(np.std(detail)), 1e-6))
+    return np.asarray(np.clip(128 + gain * detail, 0, 255), np.uint8)
+
+
+def matched_by_opencv(first: NDArray[np.uint8], second: NDArray[np.uint8], least: int, number: int) -> Float64:
+    """Disparity (rows, width) of the first picture by OpenCV's matcher, NaN where it finds none.
+
+    The second camera stands on the right. least, number: smallest disparity, and how many whole ones are tried, a
+    multiple of 16.
+    """
     block = MATCHED_BLOCK_PX**2
     matcher = cv2.StereoSGBM.create(
         minDisparity=least, numDisparities=number, blockSize=MATCHED_BLOCK_PX, P1=SMOOTHNESS[0] * block,

@@ -50,7 +50,7 @@ PRIMITIVE: Final = {4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001, 8: 0b1
 CODES: Final = {31: (11, 11), 63: (10, 27), 127: (15, 55), 255: (13, 119)}
 """BCH codes with words enough for a projector: message bits, and bits in which two words differ at least, by length."""
 MOST_REPEATED: Final = 13
-"""Repetitions of a Gray code; thirteen are as long as BCH(255, 13) with pattern and inverse of 10 bits."""
+"""Repetitions of a Gray code; with pattern and inverse of 10 bits, thirteen are about as long as BCH(255, 13)."""
 BLOCK: Final = 8
 """Columns of a block and of a stripe of `hybrid`."""
 LONGEST_HYBRID: Final = 127
