@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 SCOPE = (
     "calibration/*.py",
     *(f"drivers/{name}.py" for name in ("clock", "frames", "units", "replay/pace", "scanners/galvo")),
-    *(f"rig/{folder}/*.py" for folder in ("count", "depth", "estimate", "geometry", "plan")),
+    *(f"rig/{folder}/*.py" for folder in ("count", "depth", "estimate", "geometry", "plan", "strategies")),
     *(f"rig/{name}.py" for name in ("recording/cube", "tradeoff/limits", "tradeoff/row_light", "tradeoff/rows")),
     *(f"sim_backend/{folder}/*.py" for folder in ("effects", "frames", "light", "projector")),
     *(f"sim_backend/{name}.py" for name in ("mirror_motion", "random_numbers", "scenes/medium", "scenes/scene")),

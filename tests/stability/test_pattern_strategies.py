@@ -7,9 +7,10 @@ import pytest
 
 from rig.strategies.apparatus import Budget
 from rig.strategies.patterns import binary_codes, error_codes, phase_shift
-from rig.strategies.patterns.error_codes import log_evidence, log_factorials
+from rig.strategies.patterns.binary_codes import BinaryCode
+from rig.strategies.patterns.error_codes import Decoder, ErrorCode, log_evidence, log_factorials
 from rig.strategies.patterns.levels import Levels, flux_of, normal_cdf, with_noise
-from rig.strategies.patterns.phase_shift import fitted_sines, phase_of
+from rig.strategies.patterns.phase_shift import MicroPhaseShift, PhaseShift, fitted_sines, phase_of
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.patterns.bench import Bench, geometry, walls
 
@@ -56,6 +57,7 @@ class AllOrNothing(Stuck):
         return most * self.rng.integers(0, 2, shape)
 
 
+@covers(BinaryCode, PhaseShift, MicroPhaseShift, ErrorCode, Decoder)
 @pytest.mark.parametrize("strategy", STRATEGIES, ids=lambda s: s.name)
 @pytest.mark.parametrize("kind", [Nothing, Everything, Anything, AllOrNothing])
 @pytest.mark.parametrize("time_s", [0.02, 1.0])
