@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What a measurement took. energy_j: light that left the source."""
+    """Cost of a measurement. energy_j: light that left the source."""
 
     time_s: float
     energy_j: float

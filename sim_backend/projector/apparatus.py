@@ -50,7 +50,7 @@ class Hardware:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Request:
-    """What an apparatus is asked for.
+    """The request for an apparatus.
 
     power_w: power of the source. rule: how light is shared. seed: of all random draws. depth_range_m: nearest and
     farthest depth, which decides the gate of the pulsed source. frame_s: time of a frame of the SPAD.
@@ -124,7 +124,7 @@ class SimulatedApparatus:
             steady_per_s = self._transport.steady_per_s[part, None]
             for moment, some, turn in turns:
                 of_turn = self._transport.at_moment(light[:, some], of_part[:, some], part, moment)
-                seen = self._bits.seen(self.spad_frame_s * (steady_per_s + of_turn), part)
+                seen = self._bits.flux(self.spad_frame_s * (steady_per_s + of_turn), part)
                 add_counts(self._rng, turn[some], seen, some, counts[:, part])
         self._spend(lasts_s, lit_w)
         return counts
@@ -179,7 +179,7 @@ class SimulatedApparatus:
             for some in np.split(of_turn, range(SPOTS_AT_ONCE, len(of_turn), SPOTS_AT_ONCE)):
                 light = power_w[some, None] * self._transport.of_spots(at_row[some], at_column[some], moment)
                 flux = self.spad_frame_s * (self._transport.steady_per_s[at_row[some]] + light)
-                seen = self._bits.seen(flux[:, None], at_row[some])
+                seen = self._bits.flux(flux[:, None], at_row[some])
                 add_counts(self._rng, turn[some], seen.swapaxes(0, 1), some, counts)
         self._spend(lasts_s, lit_w)
         return counts[:, 0]
@@ -249,7 +249,7 @@ class SimulatedApparatus:
         return watts.astype(np.float32), self._request.power_w * lit
 
     def _when(self, lasts_s: Array) -> tuple[list[Moment | None], Array]:
-        """As `Transport.moments`, for exposures that follow each other from now on."""
+        """Moments and shares (`Transport.moments`) of exposures that follow each other from now on."""
         return self._transport.moments(self._time_s, self._time_s + np.cumsum(lasts_s))
 
     def _lit(self, watts: Float32) -> Iterator[tuple[slice, Float32, Float32]]:

@@ -91,7 +91,7 @@ def add_counts(
 
 
 def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCamera) -> NDArray[np.uint16]:
-    """What a conventional camera reads of pixels that collect so many electrons on average.
+    """Readings of a conventional camera whose pixels collect so many electrons on average.
 
     Electrons are Poisson distributed; a full pixel collects no more. The read-out adds Gaussian noise. The converter
     rounds to whole steps, of which its range has 2^bits - 1 for the full well above a black level of `BLACK_SIGMAS` of
@@ -107,7 +107,7 @@ def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCam
 
 
 class SensorBits:
-    """What the sensor does to the bits, pixel by pixel.
+    """The sensor's changes to the bits, pixel by pixel.
 
     Dead and hot pixels and bit errors are exact. Of crosstalk and afterpulses the mean is right: each pixel has the
     probability that it would have among such neighbours and after such a frame, but is drawn independently of them; the
@@ -131,7 +131,7 @@ class SensorBits:
         self.none = not names
         """Whether the bits stay as they are."""
 
-    def seen(self, flux: Array, rows: slice | NDArray[np.int64]) -> Array:
+    def flux(self, flux: Array, rows: slice | NDArray[np.int64]) -> Array:
         """The flux (rows, patterns, width) of a perfect sensor whose bits would be as often 1."""
         if self.none:
             return flux

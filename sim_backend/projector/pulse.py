@@ -65,7 +65,7 @@ LEAST_RANGE_M = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echoes:
-    """What comes back of pulses to the pixels of chosen rows, float64 (rows, width).
+    """Light that comes back of pulses to the pixels of chosen rows, float64 (rows, width).
 
     range_m: distance of the surface, infinite if there is none. surface_per_j: detections per joule of a pulse, of
     light that was not scattered. late_per_j: of light that was, on a way longer by detour_m on average (there and back
@@ -93,7 +93,7 @@ class FogEcho:
     optical: Array
     more: Array
 
-    def within(self, opened: "Gate") -> Array:
+    def of_bins(self, opened: "Gate") -> Array:
         """Detections per joule from parts of the gate's bins, float64 (bins, parts), without any surface."""
         per_s = 0.5 * LIGHT_M_PER_S
         parts = max(1, math.ceil(per_s * opened.bin_s / PART_M))
@@ -201,7 +201,7 @@ def first_photons(
     counts = np.zeros((rows, width, gate.bins), np.uint32)
     times = gate.start_s, gate.bin_s, gate.sigma_s
     light = pulse_j * back.surface_per_j, pulse_j * back.late_per_j, back.range_m, back.detour_m, back.steady_per_s
-    _time_photons(rng, pulses, times, np.stack(light, axis=-1), pulse_j * back.fog.within(gate), counts)
+    _time_photons(rng, pulses, times, np.stack(light, axis=-1), pulse_j * back.fog.of_bins(gate), counts)
     if bits.dead is not None and bits.hot is not None:
         counts[bits.dead | bits.hot] = 0
         counts[bits.hot, 0] = pulses
@@ -222,7 +222,7 @@ def _arrived(past_m: float, sigma_m: float, detour_m: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def expected(times: tuple[float, float, float], echo: Array, fog: Array, mean: Array) -> None:
+def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, mean: Array) -> None:
     """Write into mean (bins,) the detections that a pulse makes on average in each bin, if none blinds the pixel.
 
     times: start, length and blur of bins in s. echo: (5,) detections by the surface, not scattered and scattered, its
@@ -269,9 +269,9 @@ def _time_photons(
     rng: np.random.Generator, pulses: int, times: tuple[float, float, float], light: Array, fog: Array,
     counts: NDArray[np.uint32],
 ) -> None:  # fmt: skip
-    """Draw counts (rows, width, bins). light: (rows, width, 5), the echoes of `expected`."""
+    """Draw counts (rows, width, bins). light: (rows, width, 5), the echoes of `mean_detections`."""
     mean = np.empty(counts.shape[2])
     for y in range(counts.shape[0]):
         for x in range(counts.shape[1]):
-            expected(times, light[y, x], fog, mean)
+            mean_detections(times, light[y, x], fog, mean)
             time_first(rng, pulses, mean, counts[y, x])

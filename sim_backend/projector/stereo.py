@@ -33,14 +33,14 @@ class Seen:
 
 
 def first_view(view: CameraView, rows: NDArray[np.int64]) -> Seen:
-    """What the first camera sees in these rows."""
+    """The surfaces that the first camera sees in these rows."""
     with np.errstate(divide="ignore", invalid="ignore"):
         range_m = np.sqrt(view.u[rows] ** 2 + view.v[rows] ** 2 + 1) / view.surface[rows]
     return Seen(view.albedo[rows], np.where(np.isnan(range_m), np.inf, range_m))
 
 
 def second_view(view: CameraView, rows: NDArray[np.int64]) -> Seen:
-    """What the second camera sees in these rows."""
+    """The surfaces that the second camera sees in these rows."""
     u, v, surface, albedo = view.u[rows], view.v[rows], view.surface[rows], view.albedo[rows]
     source_x, _, source_z = view.source_m
     ends = []

@@ -13,7 +13,7 @@ from sim_backend.projector import draws, pulse, stereo, transport
 from sim_backend.projector.apparatus import SimulatedApparatus, rows_of_fan
 from sim_backend.projector.draws import count, inverted, next_wait, readings
 from sim_backend.projector.hardware import ConventionalCamera, PulsedSource
-from sim_backend.projector.pulse import LEAST_RANGE_M, FogEcho, Gate, blur_s, expected, gate
+from sim_backend.projector.pulse import LEAST_RANGE_M, FogEcho, Gate, blur_s, gate, mean_detections
 from sim_backend.projector.stereo import ambient_radiance, first_view, second_view
 from sim_backend.projector.transport import blocks, checked_columns, checked_rows, runs
 from tests.stability.inventory import EXAMPLES, covers
@@ -58,7 +58,7 @@ def test_readings_stay_within_the_range(
     assert read[1] > 0
 
 
-@covers(expected, pulse)
+@covers(mean_detections, pulse)
 @EXAMPLES
 @given(
     st.floats(1e-3, 1e12) | st.just(np.inf), st.floats(0, 1e6), st.floats(0, 1e6), st.floats(0, 1e9),
@@ -68,7 +68,7 @@ def test_echoes_are_finite_and_add_up(
     range_m: float, surface: float, fog: float, detour_m: float, bin_s: float, sigma_s: float, parts: int
 ) -> None:
     mean, of_fog = np.full(50, np.nan), np.full((50, parts), fog)
-    expected((3e-9, bin_s, sigma_s), np.array([surface, 2 * surface, range_m, detour_m, 1e3]), of_fog, mean)
+    mean_detections((3e-9, bin_s, sigma_s), np.array([surface, 2 * surface, range_m, detour_m, 1e3]), of_fog, mean)
     assert np.isfinite(mean).all()
     assert (mean >= 1e3 * bin_s * (1 - 1e-9)).all()
     assert mean.sum() <= (3 * surface + of_fog.sum() + 50 * 1e3 * bin_s) * (1 + 1e-6)
@@ -82,8 +82,8 @@ def test_the_fog_sends_back_no_more_than_without_extinction(
 ) -> None:
     none = np.zeros(len(DEPTHS))
     opened = Gate(start_s, bin_s, 20, 1e-10)
-    once = FogEcho(per_j, extinction_per_m, DEPTHS, none).within(opened)
-    more = FogEcho(per_j, extinction_per_m, DEPTHS, none + 1.0).within(opened)
+    once = FogEcho(per_j, extinction_per_m, DEPTHS, none).of_bins(opened)
+    more = FogEcho(per_j, extinction_per_m, DEPTHS, none + 1.0).of_bins(opened)
     assert np.isfinite(more).all()
     assert (once >= 0).all()
     assert (once <= more).all()

@@ -113,7 +113,7 @@ def test_crosstalk_and_afterpulses_change_the_mean_as_the_effects_on_bits_do() -
     flux = FluxModel(setup)
     p, frames = 0.3, 400
     bits = SensorBits(flux, np.arange(40), 1e-6)
-    seen = bits.seen(np.full((40, 1, 128), -math.log1p(-p)), slice(0, 40))[20, 0, 64]
+    seen = bits.flux(np.full((40, 1, 128), -math.log1p(-p)), slice(0, 40))[20, 0, 64]
     rng = np.random.default_rng(5)
     words = np.stack([packed(rng.random((40, 128)) < p) for _ in range(frames)])
     times = FrameTimes(1e-6, 1e-6)

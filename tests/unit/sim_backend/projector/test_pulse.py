@@ -13,7 +13,16 @@ from sim_backend.light.optics import LIGHT_M_PER_S, Sensor
 from sim_backend.projector import pulse
 from sim_backend.projector.draws import SensorBits
 from sim_backend.projector.hardware import PulsedSource
-from sim_backend.projector.pulse import Echoes, Gate, echoes, expected, first_photons, gate, solid_angle_sr, time_first
+from sim_backend.projector.pulse import (
+    Echoes,
+    Gate,
+    echoes,
+    first_photons,
+    gate,
+    mean_detections,
+    solid_angle_sr,
+    time_first,
+)
 from sim_backend.scenes.medium import Rain, Snow
 from tests.stability.inventory import covers
 from tests.unit.sim_backend.projector import traced_pulses
@@ -28,7 +37,7 @@ def mean_of(back: Echoes, opened: Gate, at: tuple[int, int]) -> np.ndarray:
     mean = np.zeros(opened.bins)
     light = (back.surface_per_j, back.late_per_j, back.range_m, back.detour_m, back.steady_per_s)
     times = opened.start_s, opened.bin_s, opened.sigma_s
-    expected(times, np.array([part[at] for part in light]), back.fog.within(opened), mean)
+    mean_detections(times, np.array([part[at] for part in light]), back.fog.of_bins(opened), mean)
     return mean
 
 
@@ -178,7 +187,7 @@ def test_light_scattered_more_than_once_is_about_that_of_traced_pulses(
     factor = 1 + back.late_per_j[0, 47] / back.surface_per_j[0, 47]
     assert factor == pytest.approx(1 + more_wall.sum() / once_wall.sum(), rel=0.12)
     opened = Gate(2 * 2.5 / LIGHT_M_PER_S, 2 / LIGHT_M_PER_S, 1, 1e-12)
-    fog = back.fog.within(opened).sum() / replace(back.fog, more=0 * back.fog.more).within(opened).sum()
+    fog = back.fog.of_bins(opened).sum() / replace(back.fog, more=0 * back.fog.more).of_bins(opened).sum()
     there = slice(int(2.5 / step_m), int(3.5 / step_m))
     assert fog == pytest.approx(1 + more_fog[there].sum() / once_fog[there].sum(), rel=of_fog)
     ends_m, within_m = step_m * np.arange(1, 301), np.array([0.1, 0.3])
@@ -202,6 +211,6 @@ def test_a_detour_delays_light_by_its_mean_and_loses_none() -> None:
     places_m = 0.5 * LIGHT_M_PER_S * (2e-8 + 1e-10 * (np.arange(2000) + 0.5))
     for detour_m in (0.0, 1e-3, 0.006, 0.05, 0.6):
         mean = np.zeros(opened.bins)
-        expected(times, np.array([1e-9, 1.0, 5.0, detour_m, 0.0]), np.zeros((2000, 1)), mean)
+        mean_detections(times, np.array([1e-9, 1.0, 5.0, detour_m, 0.0]), np.zeros((2000, 1)), mean)
         assert mean.sum() == pytest.approx(1, abs=1e-6)
         assert mean @ places_m == pytest.approx(5 + detour_m, abs=1e-4 + 2e-3 * detour_m)
