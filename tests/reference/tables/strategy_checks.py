@@ -1,4 +1,4 @@
-"""Strategies with patterns against closed forms, in clear air and with light that is known.
+"""Strategies against closed forms, in clear air and with light that is known.
 
     python -m tests.reference.tables.strategy_checks
 
@@ -9,6 +9,7 @@
   binomials of both kinds of error: over the bits of Gray code, over majorities, or over the words of the first 1024
   messages of a BCH code, where more errors than it corrects count as wrong (bounded decoding). `drawn` encodes, draws
   photons and decodes with the program's own functions; `nearest` takes the nearest of the 1024 words instead.
+- Lidar, dots and stereo on planes: see `tests.reference.tables.time_and_block_checks`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from rig.strategies.patterns.error_codes import bch_words, correctable, differin
 from rig.strategies.patterns.levels import Levels
 from rig.strategies.patterns.phase_shift import phase_of
 from tests.reference.tables.printed import Table, parser_of
+from tests.reference.tables.time_and_block_checks import tables
 
 EXPOSURE_S = 1e-4
 COLUMNS, BITS = 1024, 10
@@ -147,6 +149,10 @@ def main(arguments: Sequence[str]) -> int:
         share = "" if nearest is None else f"{nearest:.4f}"
         cells = f"{case.signal:g}", f"{case.ambient:g}", case.name, case.stated
         table.add((*cells, f"{closed_form(case):.4f}", f"{found:.4f}", share))
+    for titles, rows in tables():
+        table = Table(titles)
+        for row in rows:
+            table.add(row)
     return 0
 
 

@@ -64,6 +64,11 @@ class PlaneScene:
         return np.broadcast_to(1 / (self.inverse + self.tilt * self.u), (self.rows_number, self.width))
 
     @property
+    def stretch(self) -> Float64:
+        """Range over depth of each pixel."""
+        return np.sqrt(1 + self.u**2 + self.v[:, None] ** 2)
+
+    @property
     def geometry(self) -> ColumnGeometry:
         middle_x, middle_y = (self.width - 1) / 2, (self.rows_number - 1) / 2
         matrix = np.array([[self.focal_px, 0, middle_x], [0, self.focal_px, middle_y], [0, 0, 1]])
@@ -80,7 +85,7 @@ class PlaneScene:
         angle = np.arctan(self.u + self.baseline_m / self.depth_m)
         return ((angle - 0.1) / 0.45 + 1) / 2 * self.columns - 0.5
 
-    def _rate(self, pattern: np.ndarray) -> Float64:
+    def light_per_s(self, pattern: np.ndarray) -> Float64:
         """Photons a second (rows, width) of a pattern (rows, columns): the surface is lit as a line of 0.6 columns."""
         pattern = np.broadcast_to(pattern, (self.rows_number, self.columns)).astype(float)
         away = np.arange(self.columns) - self.column()[..., None]
@@ -90,18 +95,18 @@ class PlaneScene:
 
     def spad_counts(self, patterns: np.ndarray, frames: np.ndarray) -> np.ndarray:
         self._spend(float(frames.sum()) * self.spad_frame_s)
-        fired = [-np.expm1(-self._rate(pattern) * self.spad_frame_s) for pattern in patterns]
+        fired = [-np.expm1(-self.light_per_s(pattern) * self.spad_frame_s) for pattern in patterns]
         return np.array([self.rng.binomial(n, p) for n, p in zip(frames, fired, strict=True)], np.uint32)
 
     def camera_images(self, patterns: np.ndarray, exposure_s: float) -> np.ndarray:
         self._spend(len(patterns) * exposure_s)
-        mean = np.array([self._rate(pattern) * exposure_s for pattern in patterns])
+        mean = np.array([self.light_per_s(pattern) * exposure_s for pattern in patterns])
         noisy = self.rng.poisson(mean) + self.rng.normal(0, max(self.read_noise, 1e-9), mean.shape)
         return np.clip(np.rint(noisy), 0, self.camera_full_scale).astype(np.uint16)
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
         self._spend(pulses * self.spad_frame_s)
-        path = 2 / C * np.sqrt(1 + self.u**2 + self.v[:, None] ** 2)
+        path = 2 / C * self.stretch
         start_s = self.range_m[0] * path.min() - 4 * self.pulse_sigma_s
         bins = math.ceil((self.range_m[1] * path.max() + 4 * self.pulse_sigma_s - start_s) / bin_s)
         edges = start_s + bin_s * np.arange(bins + 1)

@@ -2,37 +2,24 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from rig.strategies import dots
 from rig.strategies.apparatus import Budget
-from rig.strategies.block_matching import BLOCK_PX
 from rig.strategies.dots import depth_of_dots, dot_pattern
 from rig.strategies.strategy import TooShort
+from tests.reference.tables.time_and_block_checks import INNER, dots_error_px
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plane_scene import PlaneScene
 
 covers(depth_of_dots, dot_pattern)
 BOTH = (dots.CAMERA, dots.SPAD)
-INNER = (slice(6, -6), slice(8, -8))
 
 
 def disparity_error(scene: PlaneScene, strategy: dots.Dots, time_s: float, seed: int = 5) -> np.ndarray:
     answer = strategy.measure(scene, scene.geometry, Budget(time_s), seed)
     return (scene.geometry.px_per_inverse_depth * (1 / answer.depth_m - 1 / scene.depth_m))[INNER]
-
-
-def bound_px(scene: PlaneScene, time_s: float, seed: int = 5) -> float:
-    """Cramer-Rao bound of a block's disparity with the camera's photons and read noise, by finite differences."""
-    shown, step = dot_pattern(scene.rows_number, scene.columns, seed), 1e-3
-    mean = time_s * scene._rate(shown)
-    ends = [time_s * replace(scene, inverse=scene.inverse + each)._rate(shown) for each in (-step, step)]
-    slope = (ends[1] - ends[0]) / (2 * step * scene.geometry.px_per_inverse_depth)
-    variance = mean + scene.read_noise**2
-    sums = [cv2.blur(values, BLOCK_PX[::-1])[INNER] * np.prod(BLOCK_PX) for values in (slope**2 * variance, slope**2)]
-    return float(np.sqrt(np.mean(sums[0] / sums[1] ** 2)))
 
 
 @pytest.mark.parametrize("strategy", BOTH, ids=lambda each: each.name)
@@ -45,12 +32,10 @@ def test_a_plane_is_found(strategy, inverse, tilt) -> None:
 
 @pytest.mark.parametrize("inverse", [0.3137, 0.62])
 def test_noise_moves_the_disparity_by_little_more_than_the_bound(inverse) -> None:
-    scene = PlaneScene(inverse=inverse, lit=3e5, read_noise=100.0, width=240)
-    error = disparity_error(scene, dots.CAMERA, 0.0015)
-    least = bound_px(scene, 0.0015)
-    assert abs(error.mean()) < 0.02
+    bound, found, mean = dots_error_px(100.0, inverse)
+    assert abs(mean) < 0.02
     # A parabola through hypotheses a third of a pixel apart loses up to 15 %, and the pattern's samples add 0.013 px.
-    assert 0.97 * least < error.std() < 1.15 * np.hypot(least, 0.013)
+    assert 0.97 * bound < found < 1.15 * np.hypot(bound, 0.013)
 
 
 @pytest.mark.parametrize("strategy", BOTH, ids=lambda each: each.name)

@@ -11,6 +11,7 @@ from rig.strategies.apparatus import Budget, PulseTimes
 from rig.strategies.lidar import first_photons, within
 from rig.strategies.photon_times import Nodes, fog_background, matched_filter, surfaces, without_pile_up
 from rig.strategies.strategy import TooShort
+from tests.reference.tables.time_and_block_checks import first_on_target, lidar_bound_m
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plane_scene import C, PlaneScene
 
@@ -22,31 +23,15 @@ covers(first_photons, within, surfaces, fog_background, matched_filter, without_
 def range_error(scene: PlaneScene, strategy: lidar.FlashLidar, pulses: int, seed: int = 0) -> np.ndarray:
     """Errors of the range in metres, of all pixels with an answer."""
     answer = strategy.measure(scene, scene.geometry, Budget(pulses * scene.spad_frame_s), seed)
-    stretch = np.sqrt(1 + scene.u**2 + scene.v[:, None] ** 2)
-    error = (answer.depth_m - scene.depth_m) * stretch
+    error = (answer.depth_m - scene.depth_m) * scene.stretch
     return error[np.isfinite(error)]
 
 
-def bound_m(sigma_s: float, photons: float, per_s: float) -> float:
-    """Cramer-Rao bound of the range, by numerical integration. per_s: background in counts a second."""
-    t = np.linspace(-8 * sigma_s, 8 * sigma_s, 20001)
-    pulse = np.exp(-0.5 * (t / sigma_s) ** 2) / (math.sqrt(2 * math.pi) * sigma_s)
-    slope = photons * -t / sigma_s**2 * pulse
-    return C / 2 / math.sqrt(np.sum(slope**2 / (photons * pulse + per_s)) * (t[1] - t[0]))
-
-
-def test_the_first_photon_comes_from_the_surface_as_often_as_the_closed_form_says() -> None:
-    scene = PlaneScene(rows_number=40, fog=1.0, photons=0.5, width=100, seed=4)
-    seen = scene.pulse_times(1, 1e-10)
-    found = first_photons(seen, scene.pulse_sigma_s, np.random.default_rng(1))
-    stretch = np.sqrt(1 + scene.u**2 + scene.v[:, None] ** 2)
-    arrival = 2 / C * scene.depth_m * stretch
-    on_it = np.abs(found.time_s - arrival) < 5e-10
-    some = np.isfinite(found.time_s)
-    share = on_it[some].mean() - 0.009  # fog of the last 5 of 0.1 ns counts as surface, about so much
-    closed = math.exp(-1) * -math.expm1(-0.5) / -math.expm1(-1.5)
-    assert closed == pytest.approx(0.186, abs=5e-4)
-    assert share == pytest.approx(closed, abs=4 * math.sqrt(closed * (1 - closed) / some.sum()))
+@pytest.mark.parametrize(("fog", "surface", "stated"), [(1.0, 0.5, 0.186), (0.2, 0.5, 0.640), (2.0, 0.1, 0.0147)])
+def test_the_first_photon_comes_from_the_surface_as_often_as_the_closed_form_says(fog, surface, stated) -> None:
+    closed, share, sd = first_on_target(fog, surface)
+    assert closed == pytest.approx(stated, rel=3e-3)
+    assert share == pytest.approx(closed, abs=4 * sd)
 
 
 @pytest.mark.parametrize(("photons", "flat"), [(30, 0), (100, 0), (1000, 0), (100, 1000), (300, 10_000)])
@@ -59,7 +44,7 @@ def test_the_error_of_a_histogram_is_at_its_bound(photons, flat) -> None:
     per_s = flat / (seen.counts.shape[-1] * seen.bin_s)
     # Bins widen the pulse; fewer photons than the mean weigh more than more.
     sigma_s = math.hypot(scene.pulse_sigma_s, seen.bin_s / math.sqrt(12))
-    least = bound_m(sigma_s, photons, per_s) * (1 + 0.5 / photons)
+    least = lidar_bound_m(sigma_s, photons, per_s) * (1 + 0.5 / photons)
     error = range_error(scene, lidar.PEAK, pulses)
     assert abs(error.mean()) < 0.1 * least
     assert error.std() == pytest.approx(least, rel=0.05)

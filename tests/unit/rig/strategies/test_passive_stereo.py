@@ -12,12 +12,13 @@ from calibration.model.scanner import PivotScanner
 from rig.errors import UsageError
 from rig.strategies import passive_stereo
 from rig.strategies.apparatus import Budget
-from rig.strategies.passive_stereo import depth_of_pair, rectified
+from rig.strategies.passive_stereo import depth_of_pair, detail_8_bits, matched_by_opencv, rectified
 from rig.strategies.strategy import ColumnGeometry, TooShort
+from tests.reference.tables.time_and_block_checks import stereo_errors_px
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plane_scene import PlaneScene
 
-covers(depth_of_pair, rectified)
+covers(depth_of_pair, rectified, detail_8_bits, matched_by_opencv)
 SGBM = passive_stereo.SGBM
 
 
@@ -31,6 +32,16 @@ def test_depth_errs_by_z_squared_over_bf_times_the_disparity(inverse) -> None:
     dz = (answer.depth_m - scene.depth_m)[good]
     assert dz.std() == pytest.approx(disparity[good].std() / inverse**2 / (0.3 * 300), rel=0.05)
     assert abs(disparity[good].mean()) < 0.06
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.75])
+def test_the_matcher_is_drawn_to_whole_pixels_and_the_blocks_less(fraction) -> None:
+    own, own_sd, mean, sd, ratio = stereo_errors_px(fraction)
+    assert own == pytest.approx({0.0: 0.0, 0.25: -0.17, 0.75: 0.2}[fraction], abs=0.07)
+    assert abs(mean) < 0.06
+    assert own_sd < 0.1
+    assert sd < 0.1
+    assert ratio == pytest.approx(1, rel=0.05)
 
 
 def test_a_slanted_plane_is_found_and_what_is_believed_is_right() -> None:
