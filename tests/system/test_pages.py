@@ -120,11 +120,15 @@ def typed(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     return run
 
 
-@pages
+def run_on(page: Path) -> list[tuple[str, str | None]]:
+    """The commands of a page that are run, each once."""
+    return [each for each in dict.fromkeys(commands_of(page)) if reason(each[0]) is None]
+
+
+@pytest.mark.parametrize("page", [*filter(run_on, markdown)], ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_of_a_page_do_what_it_says(page: Path, typed: Callable[[str, str | None], int]) -> None:
-    for command, into in dict.fromkeys(commands_of(page)):
-        if reason(command) is None:
-            assert typed(command, into) == 0, command
+    for command, into in run_on(page):
+        assert typed(command, into) == 0, command
 
 
 def test_most_commands_of_pages_are_run_and_every_reason_not_to_is_needed() -> None:
