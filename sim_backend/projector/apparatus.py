@@ -82,7 +82,8 @@ class SimulatedApparatus:
         camera, setting, rows = hardware.camera, flux.setting, transport.rows
         self.rows: NDArray[np.int64] = rows
         """Image rows that are measured, ascending."""
-        _, self.columns, self.width = transport.light.shape
+        self.columns: int = transport.light.shape[1]
+        self.width: int = transport.light.shape[2]
         self.spad_frame_s = request.frame_s
         self.camera_frame_s = 1 / camera.frame_rate
         self.camera_full_scale = 2**camera.bits - 1
@@ -157,7 +158,7 @@ class SimulatedApparatus:
         counts of each spot's own row.
 
         rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power. Light that a spot
-        scatters into other rows is left out. Raises ValueError for spots that do not exist, and for another brightness
+        scatters into other rows is not told. Raises ValueError for spots that do not exist, and for another brightness
         than above 0 to 1.
         """
         if not 0 < brightness <= 1:

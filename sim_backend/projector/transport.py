@@ -23,6 +23,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from itertools import pairwise
 from threading import Lock
 
@@ -45,6 +46,11 @@ Sparse = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Float32]
 
 MOMENTS = 8
 """Number of moments at which rain and snow are looked at in a call."""
+LEAVE_THE_ROW = ("halo", "forward blur")
+"""Effects that spread light over rows: those of a line's other rows make up for what leaves a row."""
+SPREAD = 3.0
+"""A spot's light that is spread to d pixels beside it along the row is spread over about `SPREAD` d rows there: 2 to 5
+for densities that fall as r^-3 to r^-1."""
 KEPT_MOMENTS = 64
 """Moments whose light is kept."""
 GROUP = 16
@@ -83,17 +89,14 @@ class Transport:
         self.steady_per_s = np.ascontiguousarray(flux.steady_per_s[rows])
         """Detections per second without the source, float64 (rows, width): ambient light and dark counts."""
         self._still = [effect for effect in flux.laser.values() if hold_s(effect) == 0]
+        self._leaving = [effect for name, effect in flux.laser.items() if name in LEAVE_THE_ROW]
         self._moving = [effect for effect in flux.laser.values() if isinstance(effect, ParticleLight)]
         self._runs = runs(rows)
         count = len(commands)
         lit = ONE_LINE.sheets(model.sheets, commands, self._view.rows, [0.0] * count, model.scanner.command_range)
         self._sheets = [sheets[0] if sheets else None for sheets in lit]
-        self.light = np.zeros((len(rows), count, self._view.width), np.float32)
+        self.light = self._computed(spots=False)
         """Detections per second and watt in a column, without drops and flakes, (rows, columns, width)."""
-        threads = max(1, min(os.cpu_count() or 1, MOST_THREADS, count))
-        cuts = np.linspace(0, count, threads + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads, thread_name_prefix="transport") as pool:
-            list(pool.map(self._fill, *zip(*pairwise(cuts), strict=True)))
         self._moments: OrderedDict[int, Moment] = OrderedDict()
         self._lock = Lock()
 
@@ -102,10 +105,25 @@ class Transport:
         """Whether the light changes with time."""
         return bool(self._moving)
 
-    def _fill(self, first: int, last: int) -> None:
+    @cached_property
+    def spot_light(self) -> Float32:
+        """The part of `light` that comes from the column's part in the very row, (rows, columns, width)."""
+        return self._computed(spots=True) if self._leaving else self.light
+
+    def _computed(self, spots: bool) -> Float32:
+        columns = len(self._sheets)
+        light = np.zeros((len(self.rows), columns, self._view.width), np.float32)
+        threads = max(1, min(os.cpu_count() or 1, MOST_THREADS, columns))
+        cuts = np.linspace(0, columns, threads + 1).astype(int).tolist()
+        with ThreadPoolExecutor(threads, thread_name_prefix="transport") as pool:
+            list(pool.map(partial(self._fill, light, spots), *zip(*pairwise(cuts), strict=True)))
+        return light
+
+    def _fill(self, light: Float32, spots: bool, first: int, last: int) -> None:
         """Compute columns first..last-1."""
         view = self._view
         rate = np.zeros((view.rows, view.width), np.float32)
+        more, pixels = np.zeros_like(rate), np.arange(view.width)
         for column in range(first, last):
             sheet = self._sheets[column]
             if sheet is None:
@@ -116,7 +134,15 @@ class Transport:
                 rate[a:b] = 0.0
                 for effect in self._still:
                     effect.add(sheet, a, b, rate)  # type: ignore[arg-type]
-            self.light[:, column] = rate[self.rows]
+                if not spots:
+                    continue
+                more[a:b] = 0.0
+                for effect in self._leaving:
+                    effect.add(sheet, a, b, more)  # type: ignore[arg-type]
+                off_px = np.abs(pixels - np.nan_to_num(sheet.x_end_px[a:b, None]))
+                more[a:b] *= 1 - 1 / np.maximum(1, SPREAD * off_px)
+                rate[a:b] = np.maximum(rate[a:b] - more[a:b], 0.0)
+            light[:, column] = rate[self.rows]
 
     def moments(self, start_s: float, ends_s: Array) -> tuple[list[Moment | None], Array]:
         """The moments whose light successive patterns get, shown from start_s on until ends_s (patterns,), and their
@@ -198,7 +224,7 @@ class Transport:
     def of_spots(self, rows: Rows, columns: Rows, moment: Moment | None) -> Float32:
         """Detections per second and watt in a whole column, (n, width), from the parts of columns (n,) in rows (n,),
         indices into `rows`. Each is seen in its own row only."""
-        found = self.light[rows, columns]
+        found = self.spot_light[rows, columns]
         if moment is not None:
             for i, at in enumerate(zip(columns.tolist(), rows.tolist(), strict=True)):
                 part = slice(moment.first[at], moment.first[at] + moment.number[at])

@@ -153,7 +153,7 @@ def test_time_and_energy_are_accounted_for(rule: str) -> None:
     assert apparatus.spent.energy_j - before.energy_j == pytest.approx(1e-4 * spot_w, rel=0.05)
 
 
-@pytest.mark.parametrize("scene", ["street-dense-fog", "street-rain"])
+@pytest.mark.parametrize("scene", ["street", "street-rain"])
 def test_a_spot_is_brighter_by_the_rows_that_the_line_covers(scene: str) -> None:
     world = world_of(scene)
     frames, rows, columns = 4000, np.repeat([1, 2], 3), np.tile([12, 20, 28], 2)
@@ -169,6 +169,21 @@ def test_a_spot_is_brighter_by_the_rows_that_the_line_covers(scene: str) -> None
         z = deviations(spots[i], frames, flux)
         assert abs(z.mean()) < 1.5  # the rows' height is right to a few percent, since the lens distorts
         assert np.median(np.abs(z)) < 2
+
+
+def test_the_halo_of_a_spot_leaves_its_row_and_nothing_else_does() -> None:
+    light, _ = world_of("street-dense-fog")._transport(ASKED["rows"], 40, ASKED["command_range"])
+    once, _ = world_of("street")._transport(ASKED["rows"], 40, ASKED["command_range"])
+    assert once.spot_light is once.light  # `street` has no light scattered more than once
+    row, column = 2, 20
+    whole, spot = light.light[row, column], light.spot_light[row, column]
+    peak = int(np.argmax(whole))
+    assert spot[peak] == pytest.approx(whole[peak], rel=0.15)
+    far = np.abs(np.arange(96) - peak) > 15
+    assert (spot <= whole).all()
+    assert (spot >= 0).all()
+    assert spot[peak + 12 :].sum() < 0.1 * whole[peak + 12 :].sum()  # behind the stripe there is only halo
+    assert spot[far].sum() < whole[far].sum()
 
 
 def test_a_dark_pattern_leaves_ambient_light_and_dark_counts() -> None:
