@@ -10,7 +10,7 @@ from rig.progress import Progress
 from rig.requests import StrategiesRequest, TradeoffRequest
 from rig.run_folder.folder import RunFolder
 from rig.strategies.apparatus import Rule
-from rig.strategies.comparison.compare import LINES, Comparison, Setting, run_comparison
+from rig.strategies.comparison.compare import LINES, Comparison, ComparisonPlan, run_comparison
 from rig.strategies.comparison.files import write_files
 from rig.strategies.comparison.places import air_problems
 from rig.strategies.strategy import find_strategy, strategy_names
@@ -63,7 +63,7 @@ def compare_strategies(
         raise UsageError.of(problems)
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], tuple(request.rules) or RULES)
-    asked = Setting(tuple(request.scenes) or SCENES, airs, times_s, rules, request.rows, request.lux, seeds)
+    asked = ComparisonPlan(tuple(request.scenes) or SCENES, airs, times_s, rules, request.rows, request.lux, seeds)
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
     with RunFolder(request.out) as folder:

@@ -45,8 +45,8 @@ def frames_within(budget: Budget, frame_s: float) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
-    """Where a line stands. of: (columns,), the place of each column. commands: (places,), their middles."""
+class LinePlaces:
+    """Places at which a line stands. of: (columns,), each column's place. commands: (places,), their middles."""
 
     of: NDArray[np.int64]
     commands: Float64
@@ -57,16 +57,16 @@ class Places:
         return len(self.commands)
 
     def patterns(self) -> NDArray[np.float32]:
-        """What is lit at each place, (places, columns): its columns."""
+        """The columns that are lit at each place, (places, columns)."""
         lit = self.of == np.arange(self.number)[:, None]
         return np.asarray(lit, np.float32)
 
 
-def places_of(commands: Float64, most: int) -> Places:
+def places_of(commands: Float64, most: int) -> LinePlaces:
     """At most `most` places, all of the same number of neighbouring columns but the last one."""
     together = -(-len(commands) // most)
     of = np.arange(len(commands)) // together
-    return Places(of, np.bincount(of, weights=commands) / np.bincount(of))
+    return LinePlaces(of, np.bincount(of, weights=commands) / np.bincount(of))
 
 
 def windowed(volume: NDArray[np.uint32], geometry: SweepGeometry, first: int) -> NDArray[np.uint32]:
@@ -91,7 +91,7 @@ class LineScan:
 
     @property
     def sentence(self) -> str:
-        """What it does, in one sentence."""
+        """One sentence that says what it does."""
         many = "a line" if self.lines == 1 else f"{self.lines} lines at once"
         filtered = "" if self.filter == "none" else " with a 5 x 5 median"
         return f"SPAD array and {many} of light, the stripe found by the estimator {self.estimator}{filtered}."
@@ -124,7 +124,7 @@ class LineScan:
         return Answer(result.depth_m, result.confidence)
 
     def _grid(self, commands: Float64) -> LineGrid:
-        """Which line lights which column: each line has a part of the field, one beside the other."""
+        """The line that lights each column: each line has a part of the field, one beside the other."""
         places = len(commands) // self.lines
         step = float(commands[1] - commands[0])
         offsets = [(line - (self.lines - 1) / 2) * places * step for line in range(self.lines)]
@@ -133,7 +133,7 @@ class LineScan:
         return line_grid(sorted(offsets), len(commands), (middle - half, middle + half))[0]
 
     def _count(
-        self, apparatus: Apparatus, sweep: SweepGeometry, one: Places, exposures: int, frames: int
+        self, apparatus: Apparatus, sweep: SweepGeometry, one: LinePlaces, exposures: int, frames: int
     ) -> CountVolume:
         """Counts of all columns, `exposures` frames each; what remains of all frames is dark."""
         patterns = np.tile(one.patterns(), (1, self.lines))

@@ -25,7 +25,7 @@ from rig.strategies.apparatus import Apparatus, Budget
 GROUP: Final = "spadrig.strategies"
 """Group of the entry points."""
 Light = Literal["spot", "line", "pattern", "flash", "ambient"]
-"""What the source lights at a time: a spot, a line or a few, a picture, everything with pulses, or nothing at all."""
+"""The source lights at a time: a spot, a line or a few, a picture, everything with pulses, or nothing at all."""
 BEYOND: Final = 0.1
 """Share of the inverse depths at the ends of the depth range by which an answer may lie beyond it, as in depth maps."""
 
@@ -52,22 +52,22 @@ class Strategy(Protocol):
 
     @property
     def name(self) -> str:
-        """As on the command line: lower case, with hyphens."""
+        """Name on the command line: lower case, with hyphens."""
         ...
 
     @property
     def sentence(self) -> str:
-        """What it does, in one sentence."""
+        """One sentence that says what it does."""
         ...
 
     @property
     def source(self) -> str:
-        """Where it is published: author, title, place, year."""
+        """Publication: author, title, place, year."""
         ...
 
     @property
     def light(self) -> Light:
-        """What its source lights at a time."""
+        """Part of the scene that its source lights at a time."""
         ...
 
     @property
@@ -84,7 +84,7 @@ class Strategy(Protocol):
 
 
 class ColumnGeometry:
-    """Where the light of each column lies, for the rows that are measured. Columns are fractional, centres at integers.
+    """Places of the light of each column, for the rows that are measured. Columns are fractional, centres at integers.
 
     Between two columns the inverse depth at which a pixel sees them is interpolated linearly, which is exact to 3e-5 of
     the depth for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.

@@ -51,9 +51,12 @@ PROTECTED: Final = "simulation for comparison only"
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """What is compared. times_s: of a measurement. rows: number of image rows in the middle of the picture. lux:
-    ambient light, None for each scene's own. airs: None is a scene's own."""
+class ComparisonPlan:
+    """Scenes, air, times and rules of a comparison.
+
+    times_s: of a measurement. rows: number of image rows in the middle of the picture. lux: ambient light, None for
+    each scene's own. airs: None is a scene's own.
+    """
 
     scenes: Sequence[str]
     airs: Sequence[str | None]
@@ -131,7 +134,10 @@ class Comparison:
 
 
 def run_comparison(
-    config: RigConfig, ways: Sequence[Strategy], asked: Setting, progress: Callable[[int, int], None] | None = None
+    config: RigConfig,
+    ways: Sequence[Strategy],
+    asked: ComparisonPlan,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """Measure with all ways and tabulate. progress: called with the number of measurements done and the total.
 
@@ -155,7 +161,7 @@ def run_comparison(
     return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], asked: Setting, folder: Path) -> Iterator[StrategyRow]:
+def _rows(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan, folder: Path) -> Iterator[StrategyRow]:
     model = rig_model(config)
     for scene, air in product(asked.scenes, asked.airs):
         name = scene.rstrip("/").rsplit("/", 1)[-1]
@@ -166,7 +172,7 @@ def _rows(config: RigConfig, ways: Sequence[Strategy], asked: Setting, folder: P
 
 
 def _of_place(
-    config: RigConfig, model: RigModel, ways: Sequence[Strategy], asked: Setting, place: tuple[str, str | None]
+    config: RigConfig, model: RigModel, ways: Sequence[Strategy], asked: ComparisonPlan, place: tuple[str, str | None]
 ) -> Iterator[StrategyRow]:
     """The rows of one scene and air."""
     scan = config.scan
