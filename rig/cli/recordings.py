@@ -159,7 +159,8 @@ def runs_command(
     with progress(compiles=False):
         found = api.runs(folder, request)
     content = {"runs": [{**asdict(entry), "taken": f"{entry.taken:%Y-%m-%dT%H:%M:%SZ}"} for entry in found]}
-    return Answer(content, lambda: tables.runs_table(found))
+    filtered = " passes all filters" if any(asdict(request).values()) else ""
+    return Answer(content, lambda: tables.runs_table(found, f"no run in {folder}{filtered}"))
 
 
 def record_command(

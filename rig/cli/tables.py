@@ -259,10 +259,13 @@ _RUNS: Columns[RunEntry] = (
 _NOTE_CHARACTERS = 60
 
 
-def runs_table(runs: Sequence[RunEntry]) -> None:
-    """Print a list of runs to stdout, one line each, in local time. `rec` before the size: with its recording."""
+def runs_table(runs: Sequence[RunEntry], without: str) -> None:
+    """Print a list of runs to stdout, one line each, in local time. `rec` before the size: with its recording.
+
+    without: what to print if there are none.
+    """
     if not runs:
-        print("no run passes")
+        print(without)
         return
     numbers = ("maps", "K", "size")
     console(WIDE).print(_table(_RUNS, runs, left=[name for name, _ in _RUNS if name not in numbers], apart=2))

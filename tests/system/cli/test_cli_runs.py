@@ -110,7 +110,9 @@ def test_runs_are_listed_and_filtered_and_a_damaged_one_does_no_harm(rig: Rig, s
     assert isinstance(found, list)
     assert [entry["folder"] for entry in found] == ["runs/a", "runs/b"]
     assert rig("runs", "--tag", "fog,night").out.count("runs/") == 1
-    assert rig("runs", "--verdict", "gaps").out == "no run passes\n"
+    assert rig("runs", "--verdict", "gaps").out == "no run in runs passes all filters\n"
+    Path("empty").mkdir()
+    assert rig("runs", "empty").out == "no run in empty\n"
     for wrong in (("--verdict", "fine"), ("--since", "soon")):
         refused = rig("runs", *wrong)
         assert (refused.code, len(refused.problems)) == (2, 1)
