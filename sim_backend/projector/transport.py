@@ -48,9 +48,10 @@ MOMENTS = 8
 """Number of moments at which rain and snow are looked at in a call."""
 LEAVE_THE_ROW = ("halo", "forward blur")
 """Effects that spread light over rows: those of a line's other rows make up for what leaves a row."""
-SPREAD = 3.0
-"""A spot's light that is spread to d pixels beside it along the row is spread over about `SPREAD` d rows there: 2 to 5
-for densities that fall as r^-3 to r^-1."""
+SPREAD, CORE = 2.0, 0.05
+"""A spot's halo at d pixels beside it along the row is spread over about `SPREAD` d + `CORE` f rows there, with the
+focal length f in pixels. From the bands of `beam_spread` (inverse Abel transform): right to 40 % for droplets up to an
+optical depth of 1, to a factor of 2 for isotropic scattering."""
 KEPT_MOMENTS = 64
 """Moments whose light is kept."""
 GROUP = 16
@@ -100,11 +101,6 @@ class Transport:
         self._moments: OrderedDict[int, Moment] = OrderedDict()
         self._lock = Lock()
 
-    @property
-    def changes(self) -> bool:
-        """Whether the light changes with time."""
-        return bool(self._moving)
-
     @cached_property
     def spot_light(self) -> Float32:
         """The part of `light` that comes from the column's part in the very row, (rows, columns, width)."""
@@ -140,7 +136,7 @@ class Transport:
                 for effect in self._leaving:
                     effect.add(sheet, a, b, more)  # type: ignore[arg-type]
                 off_px = np.abs(pixels - np.nan_to_num(sheet.x_end_px[a:b, None]))
-                more[a:b] *= 1 - 1 / np.maximum(1, SPREAD * off_px)
+                more[a:b] *= 1 - 1 / spread_rows(off_px, view.focal_px)
                 rate[a:b] = np.maximum(rate[a:b] - more[a:b], 0.0)
             light[:, column] = rate[self.rows]
 
@@ -230,6 +226,11 @@ class Transport:
                 part = slice(moment.first[at], moment.first[at] + moment.number[at])
                 found[i, moment.x[part]] += moment.value[part]
         return found
+
+
+def spread_rows(off_px: Array, focal_px: float) -> Array:
+    """Number of rows, at least 1, over which a spot's halo is spread at off_px (...) beside it along the row."""
+    return np.maximum(1.0, SPREAD * off_px + CORE * focal_px)
 
 
 def _among(effect: ParticleLight, points: Array, group: Sequence[LightSheet | None]) -> ParticleLight:

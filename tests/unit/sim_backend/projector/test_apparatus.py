@@ -5,9 +5,11 @@ import pytest
 
 from drivers.errors import DeviceError
 from rig.strategies.apparatus import Apparatus, MakesApparatus
+from sim_backend.effects.beam_spread import AT, DEPTHS, shapes
 from sim_backend.light.optics import Sensor
 from sim_backend.projector import transport
 from sim_backend.projector.apparatus import SimulatedApparatus, rows_of_fan
+from sim_backend.scenes.medium import Medium
 from sim_backend.world import SimulatedWorld
 from tests.stability.inventory import covers
 from tests.unit.sim_backend.rigs import made_world
@@ -175,15 +177,28 @@ def test_the_halo_of_a_spot_leaves_its_row_and_nothing_else_does() -> None:
     light, _ = world_of("street-dense-fog")._transport(ASKED["rows"], 40, ASKED["command_range"])
     once, _ = world_of("street")._transport(ASKED["rows"], 40, ASKED["command_range"])
     assert once.spot_light is once.light  # `street` has no light scattered more than once
-    row, column = 2, 20
-    whole, spot = light.light[row, column], light.spot_light[row, column]
-    peak = int(np.argmax(whole))
-    assert spot[peak] == pytest.approx(whole[peak], rel=0.15)
-    far = np.abs(np.arange(96) - peak) > 15
-    assert (spot <= whole).all()
-    assert (spot >= 0).all()
-    assert spot[peak + 12 :].sum() < 0.1 * whole[peak + 12 :].sum()  # behind the stripe there is only halo
-    assert spot[far].sum() < whole[far].sum()
+    world = world_of("street-dense-fog")
+    first, last = ASKED["command_range"]
+    parts = world.flux_row(int(ASKED["rows"][2]), first + 20.5 * (last - first) / 40, 1.0, 1.0)
+    halo, stripe = parts["halo"], parts["stripe"]
+    middle = float(np.sum(stripe * np.arange(96)) / stripe.sum())
+    gone = light.light[2, 20] - light.spot_light[2, 20]
+    rows = halo / (halo - gone)
+    np.testing.assert_allclose(rows, 2 * np.abs(np.arange(96) - middle) + 0.05 * 110, rtol=0.05)
+
+
+@pytest.mark.parametrize("optical", [0.1, 0.5, 1.0])
+def test_a_spots_halo_is_spread_over_the_rows_that_the_band_of_a_line_implies(optical: float) -> None:
+    lobes = Medium.model_validate({"fog": {"visibility": "10 m"}}).lobes
+    band = shapes(lobes, 1.0, 0.1)[0][np.argmin(np.abs(DEPTHS - optical))]
+    # A density K(r) around a spot adds up to the band k(x) along lines: K(r) = -1/pi int k'(x) / sqrt(x^2 - r^2) dx.
+    slope = np.diff(band) / np.diff(AT)
+    for off_px in (5, 20, 60, 150):
+        at = int(np.argmin(np.abs(AT - off_px / 600)))
+        reach = np.arccosh(AT[at:] / AT[at])
+        density = -np.sum(slope[at:] * np.diff(reach)) / np.pi
+        rows = transport.spread_rows(AT[at] * 600, 600.0)
+        assert rows == pytest.approx(600 * band[at] / density, rel=0.4)
 
 
 def test_a_dark_pattern_leaves_ambient_light_and_dark_counts() -> None:
