@@ -244,7 +244,7 @@ class Decoder:
         excess = self._excess(counts, number)
         right, _ = window.right(evidence / excess[:, None], place)
         offset, sd = self._between(counts, window, place, number)
-        return window.column(place) + offset, np.minimum(sd * np.sqrt(excess), QUANTISED_SD), right
+        return window.column(place) + offset, sd * np.sqrt(excess), right
 
     def _number(self, window: Window, place: Int64) -> Int64:
         """Number (width,) of the words of the candidates at a place."""
@@ -268,7 +268,7 @@ class Decoder:
         fall = at - np.minimum(before, after)
         rivals = np.count_nonzero(np.roll(words, 1, axis=0) != np.roll(words, -1, axis=0), axis=1)[number]
         noise = np.sqrt(rivals * (mean + 1.0 / words.shape[1]))
-        sd = np.where(fall > 0, 0.5 * noise / np.where(fall > 0, fall, 1.0), QUANTISED_SD)
+        sd = np.where(fall > 0, 0.5 * noise / np.where(fall > 0, fall, 1.0), np.inf)
         return peak_offset(before, at, after), sd
 
     def _excess(self, counts: NDArray[np.uint32], number: Int64) -> Float64:
