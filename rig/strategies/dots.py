@@ -5,6 +5,10 @@ surfaces at this depth would show it, from the calibrated columns, and compared 
 (`rig.strategies.block_matching`). Nothing is averaged over time but light: the same pattern is shown all the time, so
 one exposure is enough, and what moves is caught as it is.
 
+In fog each row has a haze of its own, the sum of what its dots light before the surface. It changes little from pixel
+to pixel, but from one row of dots to the next. So each row's mean over the width of a block is taken off, in the
+picture and in the pattern alike.
+
 With white noise of standard deviation s in each pixel and the picture's slope g along the row, the position of a block
 has at least the error of the Cramer-Rao bound, s / sqrt(sum of g^2 over the block).
 """
@@ -18,7 +22,7 @@ import numpy as np
 
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
+from rig.strategies.block_matching import BLOCK_PX, bands, best_match, exposed, independent_values, match
 from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
@@ -89,8 +93,9 @@ def depth_of_dots(picture: Float32, shown: Float32, geometry: ColumnGeometry) ->
     depth, confidence = (np.zeros(geometry.shape, np.float32) for _ in range(2))
     for rows, kept in bands(geometry.rows):
         known = list(_references(fine[rows], columns[:, rows], (inverse - low) / (high - low) * (NODES - 1)))
-        independent = independent_values(picture[rows], known[number // 2][0])
-        found = best_match(*match(picture[rows], iter(known), independent), independent, STEP_PX)
+        seen = without_haze(picture[rows])
+        independent = independent_values(seen, known[number // 2][0])
+        found = best_match(*match(seen, iter(known), independent), independent, STEP_PX)
         step = inverse[1] - inverse[0]
         at = np.interp(found.place, np.arange(number), inverse)
         sure = found.confidence * within(RIGHT * at, step * found.sd.astype(np.float64))
@@ -117,7 +122,12 @@ def _references(fine: Float32, columns: Float32, places: Float64) -> Iterator[tu
         column = columns[node] + np.float32(place - node) * (columns[node + 1] - columns[node])
         reached = np.isfinite(column)
         index = (np.where(reached, column, 0) * FINE + FINE / 2).astype(np.int64).clip(0, fine.shape[1] - 1)
-        yield np.where(reached, fine[row, index], 0).astype(np.float32), reached
+        yield without_haze(np.where(reached, fine[row, index], 0).astype(np.float32)), reached
+
+
+def without_haze(picture: Float32) -> Float32:
+    """The picture (rows, width) without each row's mean over a block's width around each pixel."""
+    return picture - np.asarray(cv2.blur(picture, (BLOCK_PX[1], 1), borderType=cv2.BORDER_REFLECT), np.float32)
 
 
 CAMERA: Final = Dots(

