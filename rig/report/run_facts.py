@@ -195,7 +195,7 @@ def _counts(reader: _Reader, counted: MapRows, number: int, found: Mapping[str, 
 
 
 def _without_frames(manifest: Mapping[str, Any]) -> str:
-    """Why rows have no counts, if the frames do not lie in the run's folder."""
+    """The reason why rows have no counts, where the frames do not lie in the run's folder."""
     parts = [part.get("folder") for part in (manifest.get("on_request") or {}).get("parts") or ()]
     if not parts:
         return "The frames were not recorded, so rows are shown without their counts."
