@@ -98,7 +98,9 @@ def test_figures_are_shown_described_and_small() -> None:
         assert figure in shown, f"no page shows {figure.name}"
         assert figure.suffix == ".svg"
         assert figure.stat().st_size < 100_000
-        assert not re.search(r'(?:href|src)="(?!#|data:)', figure.read_text()), f"{figure.name} refers to something outside"
+        assert not re.search(r'(?:href|src)="(?!#|data:)', figure.read_text()), (
+            f"{figure.name} refers to something outside"
+        )
 
 
 @pages
