@@ -44,6 +44,12 @@ def frames_within(budget: Budget, frame_s: float) -> int:
     return math.floor(budget.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 
+def shares(frames: int, places: int) -> NDArray[np.int64]:
+    """So many frames for each place (places,) that they add up to `frames` and differ by one at most."""
+    result: NDArray[np.int64] = np.diff(np.arange(places + 1) * frames // places)
+    return result
+
+
 @dataclass(frozen=True, slots=True)
 class LinePlaces:
     """Places at which a line stands. of: (columns,), each column's place. commands: (places,), their middles."""
@@ -118,7 +124,7 @@ class LineScan:
         if lines is not None:
             lines = replace(lines, overlap=window_overlap(lines, sweep))
             sweep = replace(sweep, others=lines.others(sweep.plane))
-        volume = self._count(apparatus, sweep, one, (frames - dark) // one.number, frames)
+        volume = self._count(apparatus, sweep, one, shares(frames - dark, one.number), dark)
         settings = EstimateConfig(estimator=self.estimator, filter=self.filter, min_confidence=MIN_CONFIDENCE)
         result = Reconstructor(geometry.model, commands, sweep, settings, lines=lines).map(volume)
         return Answer(result.depth_m, result.confidence)
@@ -133,25 +139,23 @@ class LineScan:
         return line_grid(sorted(offsets), len(commands), (middle - half, middle + half))[0]
 
     def _count(
-        self, apparatus: Apparatus, sweep: SweepGeometry, one: LinePlaces, exposures: int, frames: int
+        self, apparatus: Apparatus, sweep: SweepGeometry, one: LinePlaces, lit: NDArray[np.int64], dark: int
     ) -> CountVolume:
-        """Counts of all columns, `exposures` frames each; what remains of all frames is dark."""
+        """Counts of all columns. lit: (places,), frames at each place. dark: frames without light, at the end."""
         patterns = np.tile(one.patterns(), (1, self.lines))
-        dtype = np.uint8 if exposures <= 255 else np.uint16 if exposures <= 65535 else np.uint32
+        dtype = np.uint8 if lit.max() <= 255 else np.uint16 if lit.max() <= 65535 else np.uint32
         counts = np.empty((one.number * self.lines, sweep.rows, sweep.window), dtype)
         for first in range(0, one.number, AT_ONCE):
-            part = patterns[first : first + AT_ONCE]
-            seen = apparatus.spad_counts(part, np.full(len(part), exposures))
+            part = slice(first, min(first + AT_ONCE, one.number))
+            seen = apparatus.spad_counts(patterns[part], lit[part])
             for line in range(self.lines):
                 at = first + line * one.number
-                counts[at : at + len(part)] = windowed(seen, sweep, at)
-        dark = frames - exposures * one.number
+                counts[at : at + len(seen)] = windowed(seen, sweep, at)
         unlit = apparatus.spad_counts(np.zeros((1, apparatus.columns), np.float32), np.array([dark]))[0]
-        columns = len(counts)
         return CountVolume(
-            counts=counts, x0=sweep.x0, n_frames=np.full(columns, exposures, np.int32),
-            column=np.arange(columns, dtype=np.float64), dark_counts=unlit, n_dark=dark, width=sweep.width,
-            exposures=exposures,
+            counts=counts, x0=sweep.x0, n_frames=np.tile(lit, self.lines).astype(np.int32),
+            column=np.arange(len(counts), dtype=np.float64), dark_counts=unlit, n_dark=dark, width=sweep.width,
+            exposures=int(np.median(lit)),
         )  # fmt: skip
 
 

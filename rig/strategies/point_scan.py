@@ -87,12 +87,12 @@ class PointScan:
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
         """Measure once, see `Strategy`."""
         share = geometry.shape[0] / geometry.model.camera.height
-        frames = math.floor(frames_within(budget, apparatus.spad_frame_s) * share)
         tried = (len(BRIGHTNESS) + 1) * TRIED
-        grid = grid_within(frames - tried, (geometry.shape[0], geometry.columns))
+        frames = math.floor((frames_within(budget, apparatus.spad_frame_s) - tried) * share)
+        grid = grid_within(frames, (geometry.shape[0], geometry.columns)) if frames > 0 else None
         if grid is None:
-            spots = geometry.shape[0] * geometry.columns / COARSEST**2 + tried
-            raise TooShort(f"{self.name} needs {spots / share * apparatus.spad_frame_s * 1e3:.3g} ms")
+            spots = geometry.shape[0] * geometry.columns / COARSEST**2 / share + tried
+            raise TooShort(f"{self.name} needs {spots * apparatus.spad_frame_s * 1e3:.3g} ms")
         brightness = choose_brightness(apparatus, geometry, np.random.default_rng(rng_seed))
         thinned = ColumnGeometry(
             geometry.model, geometry.commands[grid.columns], geometry.depth_range_m, geometry.rows[grid.rows]

@@ -15,6 +15,7 @@ from rig.strategies.line_scan import (
     frames_within,
     peak_centroids,
     places_of,
+    shares,
     windowed,
 )
 from rig.strategies.point_scan import (
@@ -32,7 +33,17 @@ from rig.strategies.strategy import TooShort
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plain_scene import COLUMNS, HEIGHT, PlainScene, plain_geometry
 
-covers(frames_within, places_of, windowed, peak_centroids, ambient_rate, choose_brightness, first_bright, grid_within)
+covers(
+    frames_within,
+    places_of,
+    shares,
+    windowed,
+    peak_centroids,
+    ambient_rate,
+    choose_brightness,
+    first_bright,
+    grid_within,
+)
 covers(tail)
 GEOMETRY = plain_geometry()
 
@@ -121,6 +132,12 @@ def test_places_share_columns_evenly():
         np.testing.assert_allclose(places.commands, [np.flatnonzero(p).mean() for p in places.patterns()])
     assert places.number == COLUMNS
     assert frames_within(Budget(0.05), 1e-5) == 5000  # 0.05 / 1e-5 rounds to 5000.000000000001 or 4999.999
+
+
+def test_no_frame_is_left_over():
+    for frames, places in ((950, 496), (496, 496), (97, 83), (5, 5)):
+        lit = shares(frames, places)
+        assert (lit.sum(), len(lit), lit.max() - lit.min() <= 1) == (frames, places, True)
 
 
 def test_a_grid_uses_the_frames_that_there_are():
