@@ -95,3 +95,30 @@ def test_bad_options_are_one_line_each_and_leave_nothing(rig: Rig, small: Path, 
 @pytest.mark.parametrize(("config", "named"), [("lab", "is a real rig"), ("lab-emulated", "the host's time")])
 def test_only_simulated_rigs_are_tried(rig: Rig, config: str, named: str) -> None:
     assert [named in problem for problem in rig("tradeoff", config).problems] == [True]
+
+
+def test_other_ways_to_measure_depth_beside_the_line_scan(rig: Rig, small: Path, tmp_path: Path) -> None:
+    asked = ("tradeoff", small, "--strategies", "line-argmax,bch", "--scene", "ramp", "--fog", "clear,30m", "--times",
+             "2ms,20ms", "--rules", "energy", "--rows", "8")  # fmt: skip
+    ran = rig(*asked, "--out", tmp_path / "out", "--json")
+    assert ran.code == 0, ran.err
+    told = json.loads(ran.out)
+    assert len(told["rows"]) == 2 * 2 * 2
+    assert told["verdict"] == "complete"
+    names = {file.name for file in (tmp_path / "out").iterdir()}
+    assert names == {"strategies.json", "strategies.csv", "strategies.svg", "strategies-visibility.svg"}
+    shown = rig(*asked)
+    assert shown.code == 0, shown.err
+    for words in ("ramp, clear air, equal energy", "line-argmax", "laser class", "US 2023/0410333"):
+        assert words in shown.out
+
+
+def test_options_of_one_kind_of_trial_are_refused_with_the_other(rig: Rig, small: Path) -> None:
+    for options, said in (
+        (("--strategies", "line-argmax", "--exposures", "3"), "--exposures says nothing with --strategies"),
+        (("--times", "2ms"), "--times, --rules, --rows and --lux are for --strategies"),
+        (("--strategies", "nonsense"), "unknown kind 'nonsense'"),
+    ):
+        ran = rig("tradeoff", small, *options)
+        assert ran.code == 2
+        assert said in ran.err

@@ -14,14 +14,14 @@ from calibration.files.rig_file import load_rig_model
 from rig.api import compare_strategies
 from rig.errors import RigError, UsageError
 from rig.strategies.comparison import compare
-from rig.strategies.comparison.compare import Reached, StrategyRow, ranges
+from rig.strategies.comparison.compare import Comparison, Reached, StrategyRow, ranges, run_comparison
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
 from rig.strategies.comparison.places import air_problems, scene_file, visibility_m
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
 from tests.system import small_rig
 
-covers(visibility_m, Reached)
+covers(visibility_m, scene_file, Reached, Comparison, run_comparison, ranges)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,9 @@ from rig.strategies.comparison.eye_safety import (
     class_of,
     limit_j,
 )
+from tests.stability.inventory import covers
 
+covers(Beam, Field, class_of, limit_j)
 GREEN_M = 520e-9
 AREA_M2 = math.pi / 4 * PUPIL_M**2
 

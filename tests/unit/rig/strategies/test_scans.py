@@ -12,6 +12,9 @@ from rig.strategies.line_scan import (
     JOINT_4,
     LEAST_PLACES,
     LIKELIHOOD,
+    LineCamera,
+    LinePlaces,
+    LineScan,
     frames_within,
     peak_centroids,
     places_of,
@@ -22,9 +25,9 @@ from rig.strategies.point_scan import (
     BRIGHTNESS,
     COARSEST,
     FIRST_BRIGHT,
+    PointScan,
     ambient_rate,
     choose_brightness,
-    first_bright,
     grid_within,
     tail,
 )
@@ -41,10 +44,9 @@ covers(
     peak_centroids,
     ambient_rate,
     choose_brightness,
-    first_bright,
     grid_within,
 )
-covers(tail)
+covers(tail, LinePlaces, LineScan, LineCamera, PointScan)
 GEOMETRY = plain_geometry()
 
 
