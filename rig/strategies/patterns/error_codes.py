@@ -179,8 +179,8 @@ def _stripes(length: int) -> int:
 
 
 def _most_different(kind: str, codes: dict[int, tuple[int, int]], frames: int) -> int:
-    """Of codes with their number of patterns and the bits in which two words differ at least, the one that differs in
-    most frames; of several the last."""
+    """The code whose words differ in most frames, of several the last. codes: number of patterns, and of bits in which
+    two words differ at least."""
     least = min(patterns for patterns, _ in codes.values())
     if least > frames:
         raise TooShort(f"the shortest {kind} code takes {least} frames, the budget has {frames}")
@@ -237,7 +237,7 @@ class Decoder:
         return window.column(place), np.hypot(QUANTISED_SD, spread), right
 
     def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
-        """The same for the likeliest words. Between two columns the share of their light tells how far."""
+        """As `nearest`, for the likeliest words. Between two columns the share of their light tells how far."""
         evidence = window.of(self._evidence(counts))
         place = window.best(evidence)
         number = self._number(window, place)
@@ -260,7 +260,7 @@ class Decoder:
     def _between(
         self, counts: NDArray[np.uint32], window: Window, place: Int64, number: Int64
     ) -> tuple[Float64, Float64]:
-        """How far (width,) the light of the fine patterns lies from the column, -1/2 to 1/2, and its uncertainty."""
+        """Offset (width,) of the fine patterns' light from the column, -1/2 to 1/2, and its standard deviation."""
         words, counts = self.book.words[:, self.book.fine], counts[:, self.book.fine]
         mean = counts.mean(axis=1, dtype=np.float64)
         light = window.of(_in_lit(counts, words) - mean[:, None] * words.sum(axis=1, dtype=np.int64))

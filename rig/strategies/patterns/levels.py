@@ -31,12 +31,12 @@ BRIGHTEST: Final = 0.999
 NOISE_BINS: Final = 12
 """Brightness classes in which a camera's noise is fitted."""
 ADC_VARIANCE: Final = 1.0 / 12.0
-"""Of rounding to whole grey levels: the least that a camera's noise can be."""
+"""Variance of rounding to whole grey levels, the least that a camera's noise can be."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """What pixels saw of each pattern. light, variance: float64 (patterns, rows, width), in photons per frame of the
+    """Light that pixels saw of each pattern. light, variance: float64 (patterns, rows, width), in photons per frame of the
     SPAD, or grey levels of one exposure. clipped: bool (rows, width), pixels that were at full scale in any of them.
     """
 
@@ -45,7 +45,7 @@ class Levels:
     clipped: Bools
 
     def take(self, patterns: slice) -> "Levels":
-        """The same of some of the patterns."""
+        """Levels of some of the patterns."""
         return replace(self, light=self.light[patterns], variance=self.variance[patterns])
 
 
