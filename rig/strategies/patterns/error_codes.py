@@ -237,7 +237,7 @@ class Decoder:
         return window.column(place), np.hypot(QUANTISED_SD, spread), right
 
     def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
-        """As `nearest`, for the likeliest words. Between two columns the share of their light tells how far."""
+        """Return what `nearest` returns, for the likeliest words, and with the place between two columns."""
         evidence = window.of(self._evidence(counts))
         place = window.best(evidence)
         number = self._number(window, place)

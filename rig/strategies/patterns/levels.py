@@ -36,8 +36,10 @@ ADC_VARIANCE: Final = 1.0 / 12.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Levels:
-    """Light that pixels saw of each pattern. light, variance: float64 (patterns, rows, width), in photons per frame of the
-    SPAD, or grey levels of one exposure. clipped: bool (rows, width), pixels that were at full scale in any of them.
+    """Light that pixels saw of each pattern.
+
+    light, variance: float64 (patterns, rows, width), in photons per frame of the SPAD, or grey levels of one exposure.
+    clipped: bool (rows, width), pixels that were at full scale in any of them.
     """
 
     light: Float64
