@@ -204,7 +204,7 @@ def micro_sines(periods: Float64, column: ArrayLike) -> Float32:
 
 
 def unit_codes(patterns: Float32) -> Float32:
-    """Codes (patterns, columns) of columns: their brightness without its mean and at unit length, 0 if it is constant."""
+    """Codes (patterns, columns) of columns: their brightness without its mean, at unit length; 0 if it is constant."""
     centred = patterns - patterns.mean(axis=0)
     length = np.sqrt((centred**2).sum(axis=0))
     return np.asarray(centred / np.where(length > 0, length, 1.0), np.float32)
