@@ -7,8 +7,7 @@ report's working point, at most 5 % missing. The full table: `python -m tests.re
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +20,24 @@ from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene, load_scene, procedural_scene
 from tests.reference.tables.accuracy import RIGS
 from tests.reference.working_point import POINTS, WorkingPoint, score
+from tests.system.conftest import Rig
 
-RIG = Path(sys.executable).with_name("rig.exe" if sys.platform == "win32" else "rig")
 GENIE_RATIO = 1.3
 MISSING = 0.05
 MOST_PX = {10: 0.6, 20: 0.4}
 """Largest mean error without filter by exposures, at the report's working point on the prepared scenes."""
-COLUMNS = 250
+ROWS, COLUMNS = 64, 250
+Reconstruct = Callable[..., Any]
 
 
-def prepared(name: str, rows: int) -> Scene:
+def scene_of(name: str) -> Scene:
+    """The middle rows of a prepared scene, or the procedural one."""
+    if name == "procedural":
+        return procedural_scene(ROWS, 512)
     scene = load_scene(name)
     if scene is None:
         pytest.skip(f"prepared scene {name!r} is absent: ../shared/scenes/{name}/world.npz")
-    return scene.crop(rows, scene.shape[1])
+    return scene.crop(ROWS, scene.shape[1])
 
 
 def working_point(scene: Scene, light: str, rig: str, columns: int) -> WorkingPoint:
@@ -43,22 +46,23 @@ def working_point(scene: Scene, light: str, rig: str, columns: int) -> WorkingPo
     return WorkingPoint(scene, POINTS[light], geometry)
 
 
-def reconstruct(folder: Path, estimator: str = "likelihood", filtered: str = "none") -> Any:
-    """x_px (rows, columns) of the command `rig reconstruct` on the cube in `folder`."""
-    out = folder / f"out-{estimator}-{filtered}"
-    done = subprocess.run(
-        [
-            str(RIG), "reconstruct", str(folder / "cube.npy"), "--plan", str(folder / "plan.yaml"),
-            "--calibration", str(folder / "calibration.yaml"), "--estimator", estimator, "--filter", filtered,
-            "--json", "--out", str(out),
-        ],
-        capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["estimator"] == estimator
-    assert np.isfinite(np.load(out / "depth" / "000000.npy")).any()
-    with np.load(out / "stripe" / "000000.npz") as stripe:
-        return stripe["x_px"]
+@pytest.fixture
+def reconstruct(rig: Rig, tmp_path: Path) -> Reconstruct:
+    """x_px (rows, columns) of the command `rig reconstruct` on the cube in the test's folder."""
+
+    def run(estimator: str = "likelihood", filtered: str = "none") -> Any:
+        out = tmp_path / f"out-{estimator}-{filtered}"
+        done = rig(
+            "reconstruct", tmp_path / "cube.npy", "--plan", tmp_path / "plan.yaml", "--calibration",
+            tmp_path / "calibration.yaml", "--estimator", estimator, "--filter", filtered, "--json", "--out", out,
+        )  # fmt: skip
+        assert done.code == 0, done.err
+        assert json.loads(done.out)["estimator"] == estimator
+        assert np.isfinite(np.load(out / "depth" / "000000.npy")).any()
+        with np.load(out / "stripe" / "000000.npz") as stripe:
+            return stripe["x_px"]
+
+    return run
 
 
 def genie_figures(point: WorkingPoint, exposures: int, seed: int) -> dict[str, float]:
@@ -67,38 +71,35 @@ def genie_figures(point: WorkingPoint, exposures: int, seed: int) -> dict[str, f
 
 
 CASES = [
-    pytest.param("art", 96, "report", "rectified", 10, id="art, report, rectified"),
-    pytest.param(
-        "cones", 96, "report", "turned", 20, id="cones, report, rolled, distorted, tilted, scanner on the right"
-    ),
-    pytest.param("motorcycle", 96, "dense", "rectified", 10, id="motorcycle, dense fog, rectified"),
-    pytest.param("moebius", 96, "clear", "turned", 3, id="moebius, clear air, turned"),
-    pytest.param("procedural", 96, "report", "rectified", 1, id="procedural, report, one exposure"),
+    pytest.param("art", "report", "rectified", 10, id="art, report, rectified"),
+    pytest.param("cones", "report", "turned", 20, id="cones, report, rolled, distorted, tilted, scanner on the right"),
+    pytest.param("motorcycle", "dense", "rectified", 10, id="motorcycle, dense fog, rectified"),
+    pytest.param("moebius", "clear", "turned", 3, id="moebius, clear air, turned"),
+    pytest.param("procedural", "report", "rectified", 1, id="procedural, report, one exposure"),
 ]
 
 
-@pytest.mark.parametrize(("name", "rows", "light", "rig", "exposures"), CASES)
+@pytest.mark.parametrize(("name", "light", "rig_kind", "exposures"), CASES)
 def test_likelihood_comes_near_the_genie(
-    tmp_path: Path, name: str, rows: int, light: str, rig: str, exposures: int
+    tmp_path: Path, reconstruct: Reconstruct, name: str, light: str, rig_kind: str, exposures: int
 ) -> None:
-    scene = procedural_scene(rows, 512) if name == "procedural" else prepared(name, rows)
-    point = working_point(scene, light, rig, COLUMNS)
+    point = working_point(scene_of(name), light, rig_kind, COLUMNS)
     point.write_cube(tmp_path, exposures, seed=1)
     genie = genie_figures(point, exposures, 1)
-    ours = score(reconstruct(tmp_path), point.truth(), point.trusted)
+    ours = score(reconstruct(), point.truth(), point.trusted)
     assert ours["mean_abs"] <= GENIE_RATIO * genie["mean_abs"]
     assert ours["missing"] <= MISSING
     if light == "report" and name != "procedural":
         assert ours["mean_abs"] < MOST_PX[exposures]
 
 
-def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path) -> None:
-    point = working_point(procedural_scene(64, 512), "report", "rectified", COLUMNS)
+def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path, reconstruct: Reconstruct) -> None:
+    point = working_point(scene_of("procedural"), "report", "rectified", COLUMNS)
     point.write_cube(tmp_path, 10, seed=1)
     truth, trusted = point.truth(), point.trusted
 
     def error(estimator: str, filtered: str = "none") -> float:
-        return score(reconstruct(tmp_path, estimator, filtered), truth, trusted)["mean_abs"]
+        return score(reconstruct(estimator, filtered), truth, trusted)["mean_abs"]
 
     likelihood = error("likelihood")
     assert error("edge") > 2 * likelihood
@@ -108,11 +109,11 @@ def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path
 
 @pytest.mark.parametrize(("exposures", "columns", "height", "width"), [(1, 125, 77, 499), (300, 51, 40, 450)])
 def test_any_number_of_exposures_columns_and_pixels(
-    tmp_path: Path, exposures: int, columns: int, height: int, width: int
+    tmp_path: Path, reconstruct: Reconstruct, exposures: int, columns: int, height: int, width: int
 ) -> None:
     point = working_point(procedural_scene(height, width), "report", "rectified", columns)
     point.write_cube(tmp_path, exposures, seed=1)
-    x = reconstruct(tmp_path)
+    x = reconstruct()
     assert x.shape == (height, columns)
     ours = score(x, point.truth(), point.trusted)
     assert ours["missing"] <= MISSING
