@@ -84,7 +84,7 @@ def exposed(
 
 
 def match(picture: Float32, references: Iterator[tuple[Float32, Bools]], independent: float) -> tuple[Float32, Float32]:
-    """What each hypothesis leaves of the picture's variance, and the logarithm of its Bayes factor, float32
+    """The share of the picture's variance that each hypothesis leaves, and the logarithm of its Bayes factor, float32
     (hypotheses, rows, width).
 
     picture: (rows, width). references: for each hypothesis its picture and the pixels (rows, width) at which it is

@@ -49,7 +49,7 @@ tenth of a pixel in a thousand."""
 
 
 class Rectified(NamedTuple):
-    """How the raw pictures become rectified ones. focal_baseline: b f in pixels times metres, with the sign of the
+    """A way to make rectified pictures of raw ones. focal_baseline: b f in pixels times metres, with the sign of the
     second camera's side: positive if it stands on the right. maps: of `cv2.remap` for both cameras; None where the
     pictures are rectified as they are. turn: (3, 3), from the camera's frame to the rectified one. matrix: (3, 3) of
     the rectified camera.
@@ -62,8 +62,8 @@ class Rectified(NamedTuple):
 
 
 def rectified(model: RigModel) -> Rectified:
-    """How to rectify the pictures of a rig. Raises UsageError for a rig that does not say where its source stands, or
-    whose source does not stand mainly beside the camera."""
+    """The way to rectify the pictures of a rig. Raises UsageError if the rig does not say where its source stands, or
+    if this is not mainly beside the camera."""
     camera, second = model.camera, model.source_m
     if second is None or abs(second[0]) <= np.hypot(second[1], second[2]):
         raise UsageError(

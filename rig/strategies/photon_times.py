@@ -34,7 +34,7 @@ from rig.strategies.apparatus import PulseTimes
 REACH: Final = 4.0
 """Standard deviations of the pulse to either side that belong to a peak."""
 FLANK_SIGMAS: Final = (4.0, 12.0)
-"""Where the light before and behind a peak is counted, in standard deviations of the pulse."""
+"""Distances from a peak between which the light on either side is counted, in standard deviations of the pulse."""
 FOG_NODES: Final = 48
 """Intervals of time, evenly spaced in its logarithm, by which a background is fitted, and linear in between."""
 FOG_STEPS: Final = 15

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from rig.strategies import dots, lidar, passive_stereo
 from rig.strategies.apparatus import Budget, PulseTimes
 from rig.strategies.block_matching import best_match, independent_values, log_bayes_factor, match
-from rig.strategies.lidar import within
+from rig.strategies.dots import Dots
+from rig.strategies.lidar import FlashLidar, within
+from rig.strategies.passive_stereo import PassiveStereo
 from rig.strategies.photon_times import Nodes, fog_background, ratio, surfaces, without_pile_up
 from tests.stability.inventory import EXAMPLES, covers
 from tests.unit.rig.strategies.plane_scene import PlaneScene
@@ -62,6 +64,7 @@ class Stuck(PlaneScene):
         return PulseTimes(counts.astype(np.uint32), 6.5e-9, 2e-10, pulses)
 
 
+@covers(FlashLidar.measure, Dots.measure, PassiveStereo.measure)
 @pytest.mark.parametrize("kind", READINGS)
 @pytest.mark.parametrize("strategy", [*LIDARS, *PICTURES], ids=lambda each: each.name)
 @pytest.mark.parametrize("time_s", [1e-3, 0.05])
@@ -133,7 +136,7 @@ def test_formulas_hold_to_the_last_digits(digits) -> None:
         )  # fmt: skip
 
 
-@covers(fog_background)
+@covers(fog_background, Nodes)
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1.0, 1e12])
 @pytest.mark.parametrize("time_s", [np.array([0.0]), np.array([1e-9, 1e-8]), np.linspace(0, 1e-7, 700)])
 def test_any_light_is_fitted_by_something_finite(scale, time_s) -> None:

@@ -18,7 +18,7 @@ from tests.reference.tables.time_and_block_checks import stereo_errors_px
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plane_scene import PlaneScene
 
-covers(depth_of_pair, rectified, detail_8_bits, matched_by_opencv)
+covers(depth_of_pair, detail_8_bits, matched_by_opencv)
 SGBM = passive_stereo.SGBM
 
 
