@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, api, asks, say, tables
+from rig.cli.command import CommandResult, Commands, api, asks, say, tables
 from rig.cli.completion import one_of
 from rig.cli.progress import paused, progress
 from rig.requests import CameraRequest, CheckRequest, PixelsRequest, PlanesRequest, SyncRequest
@@ -40,8 +40,8 @@ def ask_at_terminal() -> "AskPerson | None":
     return ask
 
 
-def _of_result(result: "CalibrationResult") -> Answer:
-    return Answer(result.as_json(), lambda: tables.print_result(result, result.line), result.exit_code)
+def _of_result(result: "CalibrationResult") -> CommandResult:
+    return CommandResult(result.as_json(), lambda: tables.print_result(result, result.line), result.exit_code)
 
 
 @asks(PixelsRequest)
@@ -56,16 +56,16 @@ def pixels_command(
             autocompletion=one_of("config"),
         ),
     ] = "simulated",
-) -> Answer:
+) -> CommandResult:
     """Map hot, dead and noisy pixels and the dark rate, from dark frames."""
     ask = ask_at_terminal()
     with progress():
         result = api.calibrate_pixels(source, request, covered=None if ask is None else lambda: ask("cover the lens"))
-    return Answer(result.as_json(), lambda: tables.print_result(result), result.exit_code)
+    return CommandResult(result.as_json(), lambda: tables.print_result(result), result.exit_code)
 
 
 @asks(CameraRequest)
-def camera_command(request: CameraRequest, sources: SourcesArgument = None) -> Answer:
+def camera_command(request: CameraRequest, sources: SourcesArgument = None) -> CommandResult:
     """Calibrate the camera alone, from views of a board or from pictures."""
     with progress():
         result = api.calibrate_camera(sources or (), request, ask=ask_at_terminal(), tell=say)
@@ -73,7 +73,7 @@ def camera_command(request: CameraRequest, sources: SourcesArgument = None) -> A
 
 
 @asks(PlanesRequest)
-def planes_command(request: PlanesRequest, sources: SourcesArgument = None) -> Answer:
+def planes_command(request: PlanesRequest, sources: SourcesArgument = None) -> CommandResult:
     """Calibrate camera, light planes and lag from views of a board."""
     with progress():
         result = api.calibrate_planes(sources or (), request, ask=ask_at_terminal(), tell=say)
@@ -81,7 +81,7 @@ def planes_command(request: PlanesRequest, sources: SourcesArgument = None) -> A
 
 
 @asks(SyncRequest)
-def sync_command(request: SyncRequest, sources: SourcesArgument = None) -> Answer:
+def sync_command(request: SyncRequest, sources: SourcesArgument = None) -> CommandResult:
     """Measure the mirror's lag in each direction and the rows' delay, from one unmoved scene at several speeds."""
     with progress():
         result = api.calibrate_sync(sources or (), request, tell=say)
@@ -89,7 +89,7 @@ def sync_command(request: SyncRequest, sources: SourcesArgument = None) -> Answe
 
 
 @asks(CheckRequest)
-def check_command(request: CheckRequest, sources: SourcesArgument = None) -> Answer:
+def check_command(request: CheckRequest, sources: SourcesArgument = None) -> CommandResult:
     """Judge a calibration by scans of a flat board: flatness, scale, angle."""
     with progress():
         result = api.calibrate_check(sources or (), request, ask=ask_at_terminal(), tell=say)

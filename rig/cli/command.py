@@ -49,7 +49,7 @@ EXIT_ABORTED = 4
 EXIT_SOFTWARE = 70
 """An error in the program itself: EX_SOFTWARE of sysexits.h."""
 
-Commands = Mapping[str, "Callable[..., int | Answer] | tuple[str, Commands]"]
+Commands = Mapping[str, "Callable[..., int | CommandResult] | tuple[str, Commands]"]
 """Commands by name. A group is a pair: its help, and the commands in it."""
 
 ConfigArgument = Annotated[
@@ -71,7 +71,7 @@ _JSON = inspect.Parameter(
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class CommandResult:
     """Result of a command. content: printed with --json. show: prints it for people. code: the exit code. note: printed
     to stderr afterwards.
     """
@@ -93,7 +93,7 @@ def add_commands(app: typer.Typer, commands: Commands) -> None:
             app.command(name)(command(given))
 
 
-def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
+def command(function: Callable[..., int | CommandResult]) -> Callable[..., None]:
     """Wrap a command: print its answer, as JSON with the option --json; turn mistakes of the user and failures of
     devices into lines on stderr and exit codes.
     """
@@ -103,11 +103,11 @@ def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
     def wrapped(*, as_json: bool = False, **values: Any) -> None:
         try:
             answer = function(**values)
-            if isinstance(answer, Answer):
+            if isinstance(answer, CommandResult):
                 print_json(answer.content) if as_json else answer.show()
                 if answer.note:
                     say(answer.note)
-            code = answer.code if isinstance(answer, Answer) else answer
+            code = answer.code if isinstance(answer, CommandResult) else answer
         except KeyboardInterrupt as interrupt:
             code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], as_json)
         except Exception as error:
@@ -119,7 +119,7 @@ def command(function: Callable[..., int | Answer]) -> Callable[..., None]:
             code = fail(found, said, notes, as_json)
         raise typer.Exit(code)
 
-    if signature.return_annotation is Answer:
+    if signature.return_annotation is CommandResult:
         parameters = [*signature.parameters.values(), _JSON]
         wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     return wrapped
@@ -162,26 +162,26 @@ _MANY = {Sequence[str]: split_option, Sequence[int]: whole_numbers}
 """Readers of options that may be given several times and with commas, by the type of their field."""
 
 
-def asks(request_type: type[Any]) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:
+def asks(request_type: type[Any]) -> Callable[[Callable[..., CommandResult]], Callable[..., CommandResult]]:
     """Give a command an option for each field of a request. The command gets the filled request as `request`.
 
     A field for which the command already has its own option is left out.
     """
 
-    def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
+    def decorate(function: Callable[..., CommandResult]) -> Callable[..., CommandResult]:
         plain = inspect.signature(function).parameters
         asked = [each for each in options_of(request_type) if each.name not in plain]
         given = [_parameter(each) for each in asked]
 
         @functools.wraps(function)
-        def filled(**values: Any) -> Answer:
+        def filled(**values: Any) -> CommandResult:
             read = {each.name: _read(each, values.pop(each.name)) for each in asked}
             return function(request=request_type(**read), **values)
 
         shown: list[inspect.Parameter] = []
         for name, parameter in plain.items():
             shown += given if name == "request" else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-        filled.__signature__ = inspect.Signature(shown, return_annotation=Answer)  # type: ignore[attr-defined]
+        filled.__signature__ = inspect.Signature(shown, return_annotation=CommandResult)  # type: ignore[attr-defined]
         return filled
 
     return decorate
@@ -273,13 +273,13 @@ def _code_of(error: Exception) -> int | None:
     return EXIT_DEVICE if isinstance(error, DeviceError) else None
 
 
-def report(result: "RunResult") -> Answer:
+def report(result: "RunResult") -> CommandResult:
     """The answer of a command that made a run: summary, and exit code of the verdict. Warns if no pixel has a depth."""
     from rig.run_folder.manifest import RunVerdict
 
     if result.summary.valid_fraction == 0 and result.summary.verdict is not RunVerdict.UNCALIBRATED:
         say("warning: no pixel has a depth; raise --exposures, lower --min-confidence or check the depth range")
-    return Answer(result.summary.as_json(), lambda: tables.run_table(result), result.summary.verdict.exit_code)
+    return CommandResult(result.summary.as_json(), lambda: tables.run_table(result), result.summary.verdict.exit_code)
 
 
 def print_json(content: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ import typer
 from rig.cli.command import (
     EXIT_ABORTED,
     EXIT_DEVICE,
-    Answer,
+    CommandResult,
     Commands,
     ConfigArgument,
     api,
@@ -27,14 +27,14 @@ from rig.requests import AlignRequest
 def doctor_command(
     config: ConfigArgument = "simulated",
     out: Annotated[Path, typer.Option("--out", help="folder that a scan would write to")] = Path("runs"),
-) -> Answer:
+) -> CommandResult:
     """Open everything, look at the stream with the gate low, and say whether a scan could run."""
     with progress():
         findings = api.doctor(config, out=out)
     could_scan = all(one.ok for one in findings)
     lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
     content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
-    return Answer(content, lambda: print(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
+    return CommandResult(content, lambda: print(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
 
 
 @asks(AlignRequest)
@@ -44,7 +44,7 @@ def align_command(
     view: Annotated[
         bool | None, typer.Option("--view/--no-view", help="show it in the browser", show_default="if viser is there")
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Look at the laser line at low power while setting a rig up: sum image, line width, saturation; until Ctrl-C."""
     from rig.live.page import page_problem
 
@@ -64,17 +64,17 @@ def align_command(
     code = EXIT_ABORTED if last is None else 0 if found.found else 1
     note = "no line stands out: check beam, focus and gate, or raise --power or --exposures" if code == 1 else ""
     said = "aborted before the first sweep was whole" if last is None else last.line
-    return Answer(found.as_json(), lambda: print(said), code, note)
+    return CommandResult(found.as_json(), lambda: print(said), code, note)
 
 
-def devices_command() -> Answer:
+def devices_command() -> CommandResult:
     """List what is attached: USB devices that a driver knows, NI cards, Ether Dreams and Pulse Streamers on the
     network, and serial ports."""
     with progress(compiles=False):
         found = api.devices()
     lines = [f"{one.address:<32}{one.what}" for one in found]
     said = "\n".join(lines or ["no USB device, card, network device or serial port that a driver knows is attached"])
-    return Answer({"devices": [asdict(one) for one in found]}, lambda: print(said))
+    return CommandResult({"devices": [asdict(one) for one in found]}, lambda: print(said))
 
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
@@ -86,20 +86,20 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
     return 0
 
 
-def check_command(config: ConfigArgument = "simulated") -> Answer:
+def check_command(config: ConfigArgument = "simulated") -> CommandResult:
     """Say whether a config is valid and the files that it names can be read; list all problems at once."""
     with progress():
         checked = api.check_config(config)
     content = {"config": config, "name": checked.name, "valid": True}
-    return Answer(content, lambda: print(f"{config}: valid, rig '{checked.name}'"))
+    return CommandResult(content, lambda: print(f"{config}: valid, rig '{checked.name}'"))
 
 
-def show_command(config: ConfigArgument = "simulated") -> Answer:
+def show_command(config: ConfigArgument = "simulated") -> CommandResult:
     """Print a config as it is written, with every default filled in and every path absolute."""
     from rig.config.files import completed_text, config_content
 
     text = completed_text(config)
-    return Answer(config_content(text), lambda: print(text, end=""))
+    return CommandResult(config_content(text), lambda: print(text, end=""))
 
 
 def schema_command() -> int:
@@ -112,7 +112,7 @@ def schema_command() -> int:
     return 0
 
 
-def scenes_command() -> Answer:
+def scenes_command() -> CommandResult:
     """List the bundled scenes (--scene) and rigs (CONFIG), with a sentence on each."""
     listed = {"scenes": api.bundled_scenes(), "rigs": api.bundled_rigs()}
     wide = max(len(one.name) for members in listed.values() for one in members)
@@ -123,7 +123,7 @@ def scenes_command() -> Answer:
             for one in members:
                 print(f"  {one.name:<{wide}}  {one.about}")
 
-    return Answer({group: [asdict(one) for one in members] for group, members in listed.items()}, show)
+    return CommandResult({group: [asdict(one) for one in members] for group, members in listed.items()}, show)
 
 
 SCENES: Commands = {

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
+from rig.cli.command import CommandResult, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
 from rig.cli.completion import among
 from rig.cli.progress import progress
 from rig.errors import UsageError
@@ -33,14 +33,14 @@ MOST_LINES = 20
 """Most problems, and most gaps, that are shown to people; `--json` has all."""
 
 
-def verify_command(run: RunArgument) -> Answer:
+def verify_command(run: RunArgument) -> CommandResult:
     """Read every byte of a recording and say whether it is what was recorded; exit code 1 if it is not."""
     with progress(compiles=False):
         found = api.verify(run)
-    return Answer(asdict(found), lambda: _show_verification(found), found.exit_code)
+    return CommandResult(asdict(found), lambda: _show_verification(found), found.exit_code)
 
 
-def repair_command(run: RunArgument) -> Answer:
+def repair_command(run: RunArgument) -> CommandResult:
     """Make a torn recording whole: cut off torn ends and rewrite a lost index or manifest. Frames stay as they are."""
     with progress(compiles=False):
         made = api.repair(run)
@@ -49,26 +49,26 @@ def repair_command(run: RunArgument) -> Answer:
         print("\n".join(made.done or ["nothing was to be done"]))
         _show_verification(made.after)
 
-    return Answer(asdict(made), show, made.after.exit_code)
+    return CommandResult(asdict(made), show, made.after.exit_code)
 
 
 def example_command(
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty")] = Path("example"),
-) -> Answer:
+) -> CommandResult:
     """Make a small recording to try other commands on: one map of the bundled rig 'small', the same for everybody."""
     with progress():
         made = api.example_recording(out)
     if not made.as_published:
         say("warning: this computer rounds differently, so its frames are not the bits of the published recording")
     said = f"{made.folder}: {made.frames} frames, {made.bytes / 1e6:.2f} MB, sha256 of the frames {made.sha256}"
-    return Answer(made.as_json(), lambda: print(said))
+    return CommandResult(made.as_json(), lambda: print(said))
 
 
-def info_command(run: RunArgument) -> Answer:
+def info_command(run: RunArgument) -> CommandResult:
     """Describe what a recording holds."""
     with progress(compiles=False):
         found = api.recording_info(run)
-    return Answer(asdict(found), lambda: _show_info(found))
+    return CommandResult(asdict(found), lambda: _show_info(found))
 
 
 @asks(CutRequest)
@@ -76,7 +76,7 @@ def cut_command(
     request: CutRequest,
     run: RunArgument,
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-) -> Answer:
+) -> CommandResult:
     """Write a part of a recording to a folder of its own, with all that is needed to reconstruct it."""
     with progress(compiles=False):
         content = api.cut(run, out, request)
@@ -84,16 +84,16 @@ def cut_command(
     held = f"maps {first} to before {end}" if end > first else "no whole map"
     said = f"{out}: {content['recording']['blocks']} blocks, {held}"
     told = {"out": str(out), "recording": content["recording"], "cut": content["cut"]}
-    return Answer(told, lambda: print(said))
+    return CommandResult(told, lambda: print(said))
 
 
-def compress_command(run: RunArgument) -> Answer:
+def compress_command(run: RunArgument) -> CommandResult:
     """Compress a recording with zstd. All commands read it like any other."""
     with progress(compiles=False):
         made = api.compress(run)
     share = made.bytes_after / max(1, made.bytes_before)
     said = f"{made.segments} segments, {_megabytes(made.bytes_after)} ({share:.0%} of before)"
-    return Answer(asdict(made), lambda: print(said))
+    return CommandResult(asdict(made), lambda: print(said))
 
 
 def _show_verification(found: "Verification") -> None:
@@ -154,13 +154,13 @@ def runs_command(
     folder: Annotated[
         Path, typer.Argument(metavar="[FOLDER]", help="where the runs lie, up to three levels below", show_default=True)
     ] = Path("runs"),
-) -> Answer:
+) -> CommandResult:
     """List the runs in a folder, the newest last: when, what, with which verdict, note, tags and size."""
     with progress(compiles=False):
         found = api.runs(folder, request)
     content = {"runs": [{**asdict(entry), "taken": f"{entry.taken:%Y-%m-%dT%H:%M:%SZ}"} for entry in found]}
     filtered = " passes all filters" if any(asdict(request).values()) else ""
-    return Answer(content, lambda: tables.runs_table(found, f"no run in {folder}{filtered}"))
+    return CommandResult(content, lambda: tables.runs_table(found, f"no run in {folder}{filtered}"))
 
 
 def record_command(
@@ -174,7 +174,7 @@ def record_command(
         Path | None,
         typer.Argument(metavar="[RUN]", help="folder of the scan", show_default="the only one that goes on in runs"),
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Switch the recording of a scan with --record-on-request on or off, while it goes on."""
     if wish not in _WISHES:
         raise UsageError(f"'{wish}' is no wish; write on, off or state")
@@ -183,7 +183,7 @@ def record_command(
     state = record(_WISHES[wish], run)
     doing = "recording" if state.recording else "not recording"
     said = f"{state.run}: {doing}, {state.parts} part{'' if state.parts == 1 else 's'} so far"
-    return Answer(asdict(state), lambda: print(said))
+    return CommandResult(asdict(state), lambda: print(said))
 
 
 _WISHES = {"on": True, "off": False, "state": None}
@@ -195,11 +195,11 @@ def quality_command(
         str | None,
         typer.Option("--region", metavar="x0,y0,x1,y1", help="pixels of a flat surface", show_default="all pixels"),
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Judge depth without a truth: how flat a flat region comes out, how full, and how repeatable over maps."""
     with progress(compiles=False):
         found = api.quality(run, region)
-    return Answer(asdict(found), lambda: tables.quality_table(found))
+    return CommandResult(asdict(found), lambda: tables.quality_table(found))
 
 
 def report_command(
@@ -216,7 +216,7 @@ def report_command(
     number: Annotated[
         int | None, typer.Option("--map", help="number of the map to show", show_default="the last one", min=0)
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Write one HTML page on a run, or on two side by side: verdict, pictures, rows, errors, times, settings."""
     with progress(compiles=False):
         made = api.report(run, other, out=out, map=number)
@@ -226,7 +226,7 @@ def report_command(
             say(line)
         print(f"{made.file}: {made.bytes / 1e6:.2f} MB")
 
-    return Answer(asdict(made), show)
+    return CommandResult(asdict(made), show)
 
 
 @asks(ImportRequest)
@@ -245,7 +245,7 @@ def import_command(
         list[Path], typer.Argument(metavar="FILES", help="files in order, or folders of them", show_default=False)
     ],
     out: Annotated[Path, typer.Option("--out", help="folder to write, new or empty", show_default=False)],
-) -> Answer:
+) -> CommandResult:
     """Make a recording from the frames in another program's files."""
     with progress(compiles=False):
         result = api.import_frames(kind, files, out, request)
@@ -253,7 +253,7 @@ def import_command(
         say(f"warning: {hint}")
     rate = "no frame rate" if result.frame_rate_hz is None else f"{result.frame_rate_hz:g} Hz"
     said = f"{result.frames} frames of {result.width} x {result.height} pixels, {rate}: {result.folder}"
-    return Answer(asdict(result), lambda: _show_with_gaps(said, result.gaps))
+    return CommandResult(asdict(result), lambda: _show_with_gaps(said, result.gaps))
 
 
 @asks(ExportRequest)
@@ -272,7 +272,7 @@ def export_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="RUN-KIND")
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Write a run in a form that other programs read."""
     with progress(compiles=False):
         result = api.export_run(run, kind, request, out=out)
@@ -282,7 +282,7 @@ def export_command(
     files = ", ".join(result.files) if len(result.files) <= 3 else f"{len(result.files)} files"
     said = f"{' and '.join(what)} as {files}: {result.folder}"
     gaps = [(first, last) for _, first, last in result.gaps]
-    return Answer(asdict(result), lambda: _show_with_gaps(said, gaps), 1 if result.damage else 0)
+    return CommandResult(asdict(result), lambda: _show_with_gaps(said, gaps), 1 if result.damage else 0)
 
 
 def _show_with_gaps(said: str, gaps: Iterable[tuple[int, int]]) -> None:
@@ -296,7 +296,7 @@ def replay_command(
     request: ReplayRequest,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="a run taken with --record", show_default=False)],
     view: ViewOption = False,
-) -> Answer:
+) -> CommandResult:
     """Play a recording as if it were taken now, at any speed."""
     if view:
         show_page()

@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.command import (
     EXIT_ABORTED,
-    Answer,
+    CommandResult,
     Commands,
     ConfigArgument,
     ViewOption,
@@ -45,7 +45,7 @@ def scan_command(
     ] = None,
     view: ViewOption = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="compile and print the plan; nothing moves")] = False,
-) -> Answer:
+) -> CommandResult:
     """Acquire and reconstruct depth maps."""
     rig: str | RigConfig = config
     if like is not None:
@@ -70,12 +70,12 @@ def scan_command(
     return report(result)
 
 
-def _of_plan(plan: "ScanPlan", estimator: str, space: "Space | None") -> Answer:
+def _of_plan(plan: "ScanPlan", estimator: str, space: "Space | None") -> CommandResult:
     from rig.plan.describe import plan_content, plan_text
 
     recording = {} if space is None else {"recording": space.content()}
     said = f"{plan_text(plan)}\nestimator   {estimator}" + ("" if space is None else f"\nrecording   {space}")
-    return Answer({"plan": plan_content(plan), **recording}, lambda: print(said))
+    return CommandResult({"plan": plan_content(plan), **recording}, lambda: print(said))
 
 
 @asks(ReconstructRequest)
@@ -94,7 +94,7 @@ def reconstruct_command(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
     with progress():
         result = api.reconstruct(source, plan, calibration, replace(request, out=out))
@@ -154,7 +154,7 @@ def effects_command(
     column: Annotated[
         int | None, typer.Option("--column", help="of the scan, from 0: where the line is", show_default=False)
     ] = None,
-) -> Answer:
+) -> CommandResult:
     """List which physical effects a scene calls for, why, and how much each matters; or the flux of an image row.
 
     With --row and --column, print the noise-free flux of that row instead.
@@ -163,14 +163,14 @@ def effects_command(
     if row is not None or column is not None:
         with progress():
             flux = api.flux_row(chosen, scene=scene, row=row, column=column)
-        return Answer(flux, lambda: tables.flux_table(flux))
+        return CommandResult(flux, lambda: tables.flux_table(flux))
     with progress():
         effects = api.effects(chosen, scene=scene, trials=trials)
-    return Answer(asdict(effects), lambda: tables.effects_table(effects))
+    return CommandResult(asdict(effects), lambda: tables.effects_table(effects))
 
 
 @asks(StrategiesRequest)
-def tradeoff_command(request: StrategiesRequest, config: ConfigArgument = "simulated") -> Answer:
+def tradeoff_command(request: StrategiesRequest, config: ConfigArgument = "simulated") -> CommandResult:
     """Scan a simulated rig with many settings: error over sensor time and compute time, and which setting to use.
 
     With --strategies, compare other ways to measure depth in the same scenes, with the same light and time.
@@ -183,7 +183,7 @@ def tradeoff_command(request: StrategiesRequest, config: ConfigArgument = "simul
         aborted = compared.verdict == "aborted"
         note = "aborted: these are the rows that were whole by then" if aborted else ""
         code = EXIT_ABORTED if aborted else 0
-        return Answer(compared.as_json(), lambda: strategies_tables(compared), code, note)
+        return CommandResult(compared.as_json(), lambda: strategies_tables(compared), code, note)
     own = [each for each in fields(StrategiesRequest) if each.name not in _OF_TRADEOFF]
     if any(getattr(request, each.name) not in (each.default, []) for each in own):
         raise UsageError(
@@ -199,7 +199,7 @@ def tradeoff_command(request: StrategiesRequest, config: ConfigArgument = "simul
             f"error: every setting leaves more than 5 % of the answers out, so that none can be named for {done.wish}; "
             "raise --exposures"
         )
-    return Answer(done.as_json(), lambda: tables.tradeoff_table(done), code, note)
+    return CommandResult(done.as_json(), lambda: tables.tradeoff_table(done), code, note)
 
 
 _OF_TRADEOFF = tuple(each.name for each in fields(TradeoffRequest))

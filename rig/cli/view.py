@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import Answer, Commands, asks, say
+from rig.cli.command import CommandResult, Commands, asks, say
 from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.requests import StreamRequest, ViewRequest
@@ -23,7 +23,7 @@ def view_command(
         Path | None, typer.Argument(metavar="[RUN]", help="folder of a run, recorded or not", show_default=False)
     ] = None,
     live: Annotated[bool, typer.Option("--live", help="show the running scan, or wait for one")] = False,
-) -> Answer:
+) -> CommandResult:
     """Show a run in the browser: point cloud, pictures, counts under the cursor, fog and health."""
     if live == (run is not None):
         what = "both a run and --live" if live else "neither a run nor --live"
@@ -43,11 +43,11 @@ def view_command(
         from rig.view.viewer import view
 
         view(run, request, ready=ready)
-    return Answer({"url": address[0]}, lambda: None)
+    return CommandResult({"url": address[0]}, lambda: None)
 
 
 @asks(StreamRequest)
-def stream_command(request: StreamRequest) -> Answer:
+def stream_command(request: StreamRequest) -> CommandResult:
     """Send the depth maps of running scans to other programs over TCP, until Ctrl-C."""
     from rig.stream.server import serve
 
@@ -62,7 +62,7 @@ def stream_command(request: StreamRequest) -> Answer:
 
     counts = serve(request, ready=ready)
     said = f"{counts.clients} clients were served {counts.maps_sent} maps, {counts.refused} were refused"
-    return Answer({"address": address[0], **asdict(counts)}, lambda: print(said))
+    return CommandResult({"address": address[0], **asdict(counts)}, lambda: print(said))
 
 
 COMMANDS: Commands = {"view": view_command, "stream": stream_command}

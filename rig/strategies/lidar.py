@@ -27,7 +27,7 @@ import numpy as np
 
 from rig.simd import Float64
 from rig.strategies.apparatus import Apparatus, Budget, PulseTimes
-from rig.strategies.photon_times import Peaks, surfaces
+from rig.strategies.photon_times import TimedSurfaces, surfaces
 from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
 
 LIGHT_M_PER_S: Final = 299792458.0
@@ -72,7 +72,7 @@ class FlashLidar:
         else:
             between_s = (near_m * path).ravel(), (far_m * path).ravel()
             flat = surfaces(seen, sigma_s, between_s, fog=self.method == "gamma", coates=self.coates)
-            found = Peaks(*(values.reshape(path.shape) for values in flat))
+            found = TimedSurfaces(*(values.reshape(path.shape) for values in flat))
         depth_m = found.time_s / path
         good = usable & (depth_m >= near_m * (1 - RIGHT)) & (depth_m <= far_m * (1 + RIGHT))
         near_enough = within(RIGHT * found.time_s, found.sd_s)
@@ -80,7 +80,7 @@ class FlashLidar:
         return Answer(np.where(good, depth_m, np.nan).astype(np.float32), confidence.astype(np.float32))
 
 
-def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) -> Peaks:
+def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) -> TimedSurfaces:
     """The first photon that each pixel detected in all pulses, arrays (rows, width).
 
     Pulses are alike, so each of a pixel's photons was the first one with the same probability; it is drawn. Whether it
@@ -121,7 +121,7 @@ def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) ->
     odds = math.log(share / (1 - share)) + with_it * np.log1p(more / chance) - more
     seen_at_all = np.isfinite(time_s)
     believed = np.where(seen_at_all, _logistic(odds), 0.0)
-    return Peaks(time_s, np.where(seen_at_all, sigma_s, 0.0), seen_at_all * 1.0, believed)
+    return TimedSurfaces(time_s, np.where(seen_at_all, sigma_s, 0.0), seen_at_all * 1.0, believed)
 
 
 def within(limit: Float64, sd: Float64) -> Float64:

@@ -48,7 +48,7 @@ Counts = NDArray[np.uint32]
 Whole = NDArray[np.int64]
 
 
-class Peaks(NamedTuple):
+class TimedSurfaces(NamedTuple):
     """The surface of each pixel, float64 (pixels,): time_s of its return; sd_s, standard deviation of that time by the
     Cramer-Rao bound with the pixel's own counts; photons of it; confidence that it is a surface, 0 to 1. time_s is NaN
     and the others 0 where no photon came while a surface could have sent it.
@@ -60,7 +60,9 @@ class Peaks(NamedTuple):
     confidence: Float64
 
 
-def surfaces(seen: PulseTimes, sigma_s: float, between_s: tuple[Float64, Float64], *, fog: bool, coates: bool) -> Peaks:
+def surfaces(
+    seen: PulseTimes, sigma_s: float, between_s: tuple[Float64, Float64], *, fog: bool, coates: bool
+) -> TimedSurfaces:
     """The surface of each pixel of a histogram (rows, width, bins), by its largest peak; arrays (rows width,).
 
     sigma_s: standard deviation of the pulse. between_s: first and last time (rows width,) at which a surface can
@@ -95,7 +97,7 @@ def surfaces(seen: PulseTimes, sigma_s: float, between_s: tuple[Float64, Float64
     widths = sigma, nearest, farthest
     _judge(counts, pulses, matched, places, light, nodes.of_bin, nodes.share, best, widths, found)
     at, sd, photons, confidence = found
-    return Peaks(
+    return TimedSurfaces(
         np.where(photons > 0, seen.start_s + seen.bin_s * (at + 0.5), np.nan), seen.bin_s * sd, photons, confidence
     )
 
