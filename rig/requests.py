@@ -191,10 +191,10 @@ class StrategiesRequest(TradeoffRequest):
     """
 
     strategies: Sequence[str] = option((), "ways to measure depth, or all, by commas", unset="none: settings are tried")
-    times: Sequence[str] = option((), "with --strategies: times, by commas", unset="1ms,10ms,50ms,200ms,1s")
-    rules: Sequence[str] = option((), "with --strategies: of energy, irradiance", unset="both")
-    rows: int = option(64, "with --strategies: image rows in the middle of the picture", least=1)
-    lux: float | None = option(None, "with --strategies: ambient light", unset="the scene's, else 5")
+    times: Sequence[str] = option((), "times for strategies, by commas", unset="1ms,10ms,50ms,200ms,1s")
+    rules: Sequence[str] = option((), "for strategies: energy, irradiance", unset="both")
+    rows: int = option(64, "image rows for strategies, in the middle of the picture", least=1)
+    lux: float | None = option(None, "ambient light for strategies", unset="the scene's, else 5")
 
 
 @described
