@@ -121,7 +121,10 @@ class CameraProblem:
         )
 
     def solve(self, used: Sequence[Mask]) -> CameraSolution:
-        """The least squares camera from the corners used, and the poses of all views. Raises Degenerate if it fails."""
+        """The camera, by a least-squares fit to the used corners, and the poses of all views.
+
+        Raises Degenerate if the fit fails.
+        """
         kept = [i for i, mask in enumerate(used) if mask.any()]
         points = [self.points_m(i)[used[i]].astype(np.float32) for i in kept]
         px = [self.corners[i].px[used[i]].astype(np.float32) for i in kept]

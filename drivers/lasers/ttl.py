@@ -27,7 +27,7 @@ BY_HAND = "by hand, W: "
 
 
 class TtlConfig(KindConfig):
-    """Config of a laser that is switched by hand."""
+    """Config of a laser without a port: it is switched on by hand, and then shines while the gate is high."""
 
     kind: Literal["ttl"] = "ttl"
     power: Annotated[Watts, Field(gt=0)]

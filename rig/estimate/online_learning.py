@@ -41,7 +41,9 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearningSetting:
-    """A model and the kind of sweep for which tables are made. exposures: nominal; dark: whether there are dark frames.
+    """A model and the kind of sweep for which tables are made.
+
+    exposures: nominal number of frames of a column. dark: whether there are dark frames.
 
     Raises UsageError if the model was learned from a sweep of another size.
     """

@@ -85,8 +85,10 @@ class Apparatus(Protocol):
         ...
 
     def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
-        """Images of two conventional cameras in ambient light only, without the narrow filter: (2, rows, width). The
-        second one stands where the light source is, and looks the same way as the first. A single exposure.
+        """Take one image with each of two conventional cameras, in ambient light only: (2, rows, width).
+
+        The second camera stands where the light source is, and looks in the same direction as the first. Both are
+        without the narrow filter.
         """
         ...
 

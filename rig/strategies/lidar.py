@@ -81,13 +81,14 @@ class FlashLidar:
 
 
 def first_photons(seen: PulseTimes, sigma_s: float, rng: np.random.Generator) -> TimedSurfaces:
-    """The first photon that each pixel detected in all pulses, arrays (rows, width).
+    """The first photon that each pixel detected in all pulses; arrays (rows, width).
 
-    Pulses are alike, so each of a pixel's photons was the first one with the same probability; it is drawn. Whether it
-    came from a surface is judged by the first photons of up to `NEIGHBOURS` pixels to either side in the row: those
-    that come with it (within 3 standard deviations of the pulse) against those shortly before and behind, which tell
-    how many come with it by chance. The share of photons that come from surfaces is estimated over the whole picture,
-    from neighbours that come together.
+    The histogram does not say which photon came first. All pulses are alike, so each photon of a pixel is equally
+    likely to be the first, and one is drawn at random. The first photons of up to `NEIGHBOURS` pixels on either side in
+    the row say whether it came from a surface: how many arrive at the same time (within 3 standard deviations of the
+    pulse) is compared with how many would do so by chance. The latter follows from those that arrive shortly before or
+    after. The share of photons that come from surfaces is estimated over the whole picture, from how often two
+    neighbours agree.
     """
     total = seen.counts.sum(axis=-1, dtype=np.int64)
     drawn = rng.integers(0, np.maximum(total, 1))

@@ -63,11 +63,11 @@ class TimedSurfaces(NamedTuple):
 def surfaces(
     seen: PulseTimes, sigma_s: float, between_s: tuple[Float64, Float64], *, fog: bool, coates: bool
 ) -> TimedSurfaces:
-    """The surface of each pixel of a histogram (rows, width, bins), by its largest peak; arrays (rows width,).
+    """The surface that each pixel sees, found as the largest peak of its histogram; arrays (rows x width,).
 
-    sigma_s: standard deviation of the pulse. between_s: first and last time (rows width,) at which a surface can
-    answer. fog: whether the peak is sought in what exceeds the fitted light of fog, rather than a constant background.
-    coates: whether pile-up is corrected.
+    seen: its histogram is (rows, width, bins). sigma_s: standard deviation of the pulse. between_s: first and last time
+    at which light of a surface can arrive, (rows x width,) each. fog: whether the background is the fitted light of
+    fog; otherwise it is constant. coates: whether pile-up is corrected.
     """
     bins = seen.counts.shape[-1]
     counts = np.ascontiguousarray(seen.counts).reshape(-1, bins)

@@ -85,7 +85,7 @@ class PointScan:
     light: Light = "spot"
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once, see `Strategy`."""
+        """Measure once (see `Strategy`)."""
         share = geometry.shape[0] / geometry.model.camera.height
         tried = (len(BRIGHTNESS) + 1) * TRIED
         frames = math.floor((frames_within(budget, apparatus.spad_frame_s) - tried) * share)
@@ -194,9 +194,10 @@ def _sums(values: Float64, reach: int) -> Float64:
 
 
 def ambient_rate(volume: CountVolume, geometry: SweepGeometry) -> Float64:
-    """Probability (rows, width) that a pixel counts without the spot: from spots that it lies behind at any depth.
+    """Probability (rows, width) per frame that a pixel counts without light of the spot.
 
-    Pixels on the near side of a window have light from fog.
+    It is learned from frames in which the pixel lies on the far side of all places where the spot can be. Pixels on the
+    near side are left out, since fog sends them light of the spot.
     """
     columns, rows, window = volume.counts.shape
     ones, frames = np.zeros((rows, volume.width)), np.zeros((rows, volume.width))

@@ -4,11 +4,12 @@ A pixel that detects on average L photons in a frame reads 1 with probability 1 
 
     N ~ Binomial(n, 1 - exp(-L)),    P(N = 0) = exp(-n L)
 
-drawn exactly. Going from pixel to pixel, one exponential variate says how much n L passes until the next pixel that
-fires at all; its count is found by inversion (the chances of 1, 2, 3, ... one after the other) where few frames fire or
-few do not, otherwise by rejection (`numpy.random.Generator.binomial`, BTPE). A flux of 0 never fires, an infinite one
-always. Draws go row by row, pattern by pattern and pixel by pixel, so they do not depend on how rows are grouped.
-Measured on one core: 2 ns for a pixel that does not fire, 40 ns for a few counts, 100 ns for many.
+These counts are drawn exactly. Most pixels may not fire at all, so they are skipped: n L is summed from pixel to pixel,
+and one exponential variate is the sum at which the next pixel fires. If few of its frames fire, or nearly all, its
+count is found by inversion (the chances of 1, 2, 3, ... one after the other), otherwise by rejection
+(`numpy.random.Generator.binomial`, BTPE). A flux of 0 never fires, an infinite one always. Draws go row by row, pattern
+by pattern and pixel by pixel, so they do not depend on how rows are grouped. Measured on one core: 2 ns for a pixel
+that does not fire, 40 ns for a few counts, 100 ns for many.
 """
 
 import math

@@ -229,7 +229,10 @@ class Transport:
 
 
 def spread_rows(off_px: Array, focal_px: float) -> Array:
-    """Number of rows, at least 1, over which a spot's halo is spread at off_px (...) beside it along the row."""
+    """Number of rows, at least 1, over which the halo of a spot is spread.
+
+    off_px: distance from the spot along the row in pixels, any shape; the result has the same shape.
+    """
     return np.maximum(1.0, SPREAD * off_px + CORE * focal_px)
 
 

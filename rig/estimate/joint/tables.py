@@ -24,11 +24,11 @@ MOST_BYTES = 4 << 30
 
 
 class JointTables(NamedTuple):
-    """All that `tables_of` makes once per model, geometry and number of exposures, and the inputs that kernels need
-    with it: `sweep`, `state` and `dark`.
+    """All that `tables_of` makes once per model, geometry and number of exposures.
 
-    contrast: None if not needed. shares: of `profile_table`. halo: of `halo_shares`, without pixels if there is no
-    halo. dark: whether there are dark frames.
+    `sweep`, `state` and `dark` are no tables, but kernels need them too. contrast: None if not needed. shares: made by
+    `profile_table`. halo: made by `halo_shares`; it has no pixels if there is no halo. dark: whether there are dark
+    frames.
     """
 
     grid: LabelGrid

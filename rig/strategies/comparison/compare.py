@@ -115,7 +115,7 @@ class Comparison:
 
     @property
     def seconds(self) -> dict[str, dict[str, float]]:
-        """Seconds of the computer by strategy and scene."""
+        """Computing time in seconds, by strategy and scene."""
         found: dict[str, dict[str, float]] = {}
         for row in self.rows:
             of = found.setdefault(row.strategy, {})
@@ -139,7 +139,7 @@ def run_comparison(
     asked: ComparisonPlan,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Measure with all ways and tabulate. progress: called with the number of measurements done and the total.
+    """Measure with all strategies and tabulate. progress: called with the number of measurements done and the total.
 
     Raises UsageError if a scene cannot be used, and RigError if a strategy takes more time than it has. An interrupt
     ends the comparison after the last complete row; before the first one it is raised again.

@@ -159,7 +159,10 @@ class BinaryCode:
         return shown, [1.0] * (len(code) - 1) + [longer, longer]
 
     def contrast(self, levels: Levels) -> tuple[Float64, Float64]:
-        """Light above the middle between lit and dark, and its standard deviation: (bits, rows, width) each."""
+        """How far the light of each bit is above the middle between lit and dark, and the standard deviation of this.
+
+        Both are (bits, rows, width). Where the first is positive the bit is 1.
+        """
         light, variance = levels.light, levels.variance
         if self.inverse:
             return 0.5 * (light[::2] - light[1::2]), 0.5 * np.sqrt(variance[::2] + variance[1::2])

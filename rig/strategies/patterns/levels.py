@@ -52,7 +52,10 @@ class Levels:
 
 
 def spad_frames(apparatus: Apparatus, budget: Budget, weights: Sequence[float]) -> NDArray[np.int64]:
-    """Frames for each pattern, int64, shared by weight, at least 1 each. Raises `TooShort` with fewer than that."""
+    """Number of frames for each pattern, int64, in proportion to its weight and at least 1.
+
+    Raises `TooShort` if the budget has fewer frames than there are patterns.
+    """
     share = np.asarray(weights, np.float64)
     total = int(budget.time_s / apparatus.spad_frame_s * (1 + ROUNDING))
     if total < len(share):
@@ -147,7 +150,7 @@ def _fitted_noise(mean: Float64, spread: Float64, spare: int) -> tuple[float, fl
 
 
 def normal_cdf(z: Float64) -> Float64:
-    """Probability that a standard normal variable is below z; within 2e-7 (Abramowitz and Stegun 26.2.17)."""
+    """Probability that a standard normal variable is below z, exact to 2e-7 (Abramowitz and Stegun 26.2.17)."""
     t = 1.0 / (1.0 + 0.2316419 * np.abs(z))
     poly = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
     upper = np.exp(-0.5 * np.square(np.minimum(np.abs(z), 38.0))) * (poly / np.sqrt(2.0 * np.pi))

@@ -392,7 +392,7 @@ def _fetch_table(at: LabelTables, i: int, fitted: Fitted) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def fit_tables(room: CostRoom, ways: Ways, first: int, last: int) -> None:
-    """Fill the fitted parts of tables first..last-1, for the usual number of exposures. room: pointers."""
+    """Fill the fitted parts of tables first..last-1 in `room`, for the usual number of exposures."""
     fitted = Fitted(room.at.fitted_constant, room.at.fitted_edge)
     for i in range(first, last):
         _fit_table(room.at, i, i, ways.units * ways.exposures, fitted, room.buffers.through)
