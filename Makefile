@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Images of containers often set it. Then each of the hundreds of processes that tests start compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo help install test checks kernels lint types layers house docs figures unit clean
+.PHONY: demo help install test checks kernels lint types layers house docs figures collected unit clean
 .PHONY: packages pythons accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .DELETE_ON_ERROR:
@@ -23,7 +23,7 @@ help:  ## this list
 # The kernels are compiled once, by one core, while the other makes all else: four workers that start cold would each
 # compile them. The kernels come first, since they take longest.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
-	$(MAKE) --jobs=2 --output-sync=target kernels checks docs NOTEBOOKS=off SITE=docs/_build/check
+	$(MAKE) --jobs=2 --output-sync=target kernels checks docs collected NOTEBOOKS=off SITE=docs/_build/check
 	$(PYTEST) --durations=25
 
 checks: lint types layers house
@@ -46,6 +46,9 @@ docs: .venv/.installed-tests  ## the documentation site in docs/_build/html; its
 	NOTEBOOKS=$(NOTEBOOKS) $(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs . $(SITE)
 figures: .venv/.installed-tests  ## draw the figures of docs/figures/ anew
 	$(BIN)/python -m docs.generate.figures
+# Python files of tests are compiled, with messages for their assertions: else each worker does so itself, 10 s long.
+collected: .venv/.installed-tests
+	-$(BIN)/pytest --collect-only -qq > /dev/null
 # Files of tests go to the workers whole: what they prepare once is prepared once.
 WORKERS ?= 4
 PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
