@@ -2,8 +2,8 @@
 
 An `Apparatus` is one camera in front of one scene, with one light source of a given power. A strategy chooses what is
 lit and for how long, and gets what the camera reads. It never learns of the scene, the medium or the noise. The
-simulated one is `sim_backend.projector`; the apparatus keeps an account of time and energy, which `compare` holds
-against the budget.
+simulated apparatus is `sim_backend.projector`. Every apparatus adds up the time and energy that it has used;
+`rig.strategies.comparison` compares the time with the budget.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ from drivers.interfaces import Spent as Spent
 from drivers.interfaces import World
 
 Rule = Literal["energy", "irradiance"]
-"""Rule by which light is shared. `energy`: every pattern has the whole power, spread over what it lights, so a line is
-brighter than a picture. `irradiance`: a lit column is equally bright however many are lit, namely as bright as the
+"""Rule by which columns share the light. `energy`: the columns that are lit share the whole power, so a line is
+brighter than a picture. `irradiance`: a lit column has the same brightness however many are lit. It is that of the
 whole power spread over half of the columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limit of a measurement. time_s: from the first exposure to the end of the last, all patterns together."""
+    """Limit of a measurement. time_s: from the beginning of the first exposure to the end of the last one."""
 
     time_s: float
 
@@ -33,7 +33,7 @@ class Apparatus(Protocol):
     """One camera, one light source, one scene. Counts are drawn anew at every call; calls follow each other in time."""
 
     rows: NDArray[np.int64]
-    """Image rows that are measured, ascending; all other shapes say `rows` for their number."""
+    """Image rows that are measured, ascending. In the shapes of other arrays `rows` is the number of these rows."""
     width: int
     """Pixels per row."""
     columns: int
@@ -56,7 +56,7 @@ class Apparatus(Protocol):
         """Show patterns one after the other, each for some frames of the SPAD, and count the frames in which each pixel
         fired: (patterns, rows, width).
 
-        patterns: (patterns, columns), or (patterns, rows, columns) where rows differ; relative brightness, 0 to 1. A
+        patterns: relative brightness, 0 to 1, (patterns, columns), or (patterns, rows, columns) if rows differ. A
         pattern that is all zeros is dark. frames: (patterns,), at least 1.
         """
         ...
@@ -78,9 +78,11 @@ class Apparatus(Protocol):
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
-        pixel detects after each pulse. The pulses have the mean power of the source. Light from a range r comes 2 r / c
-        after the middle of its pulse has left, with the source at the camera. A gate keeps the pixels off before the
-        nearest depth can answer and after the farthest.
+        pixel detects after each pulse.
+
+        The pulses have the mean power of the source, which is at the camera. Light from a distance r arrives 2 r / c
+        after the middle of its pulse has left. A gate switches the pixels on only while light from within the depth
+        range can arrive.
         """
         ...
 
@@ -101,11 +103,11 @@ class MakesApparatus(World, Protocol):
         self, *, rows: NDArray[np.int64], columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
         seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
     ) -> Apparatus:  # fmt: skip
-        """An apparatus at time 0. Light transport is kept, so another one for the same rows and columns is quick.
+        """Make an apparatus at time 0. Light transport is kept, so another one for the same rows and columns is quick.
 
-        rows: image rows to measure, ascending. columns, command_range: as in a scan, column c is the line at the
-        mirror's command first + (c + 0.5) (last - first) / columns. power_w: mean power of the source. seed: of all
-        random draws. depth_range_m: gate of the pulsed source. Raises ValueError for values that cannot be, and
-        DeviceError for a scene that moves.
+        rows: image rows to measure, ascending. columns: their number. command_range: first and last command of the
+        mirror; as in a scan, column c is the line at the command first + (c + 0.5) (last - first) / columns. power_w:
+        mean power of the source. seed: of all random draws. depth_range_m: range for which the gate of pulses is open.
+        Raises ValueError for impossible values, and DeviceError for a scene that moves.
         """
         ...

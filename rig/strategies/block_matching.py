@@ -1,18 +1,19 @@
-"""Block matching along the row, with the probability that a match is right: what dots and stereo share.
+"""Block matching along the row, with the probability that a match is right. Dots and stereo both use it.
 
-A picture is compared with one reference for each hypothesis (a shift, or an inverse depth) by the normalised
-correlation r of the blocks around each pixel. In a block of n independent values the best fit of gain and offset leaves
-the share 1 - r^2 of the picture's variance. Whether a hypothesis explains a block better than noise does is told by the
-Bayes factor of a regression with Zellner's g-prior, g = n (Liang et al., J. Am. Stat. Assoc. 103, 2008):
+Each hypothesis (a shift, or an inverse depth) has a reference picture. The picture is compared with it by the
+normalised correlation r of the blocks around each pixel. In a block of n independent values the best fit of gain and
+offset leaves the share 1 - r^2 of the picture's variance. The Bayes factor of a regression with Zellner's g-prior, g =
+n, tells whether the hypothesis explains a block better than noise does (Liang et al., J. Am. Stat. Assoc. 103, 2008):
 
     B = (1 + n)^((n - 2) / 2) / (1 + n (1 - r^2))^((n - 1) / 2),      r > 0
 
-The probability of an answer is the sum of B over the hypotheses next to it, over the sum of all, with even odds
-beforehand that no hypothesis is right. Neighbouring pixels are not independent: n is the number of pixels of a block
-over the sum of the products of both autocorrelations (Bartlett, J. R. Stat. Soc. 98, 1935).
+The probability of an answer is the sum of B over the hypotheses next to it, divided by the sum of (B + 1) over all
+hypotheses: beforehand it is as likely that none of them is right as that one is. Neighbouring pixels are not
+independent: n is the number of pixels of a block, divided by the sum over all lags of the product of the two pictures'
+autocorrelations (Bartlett, J. R. Stat. Soc. 98, 1935).
 
-About its minimum 1 - r^2 is a parabola a + q (d - d0)^2, from which d0 is found between hypotheses. Its curvature gives
-the standard deviation of d0, sqrt(a / (n q)), in the same unit as d.
+About its minimum 1 - r^2 is a parabola a + q (d - d0)^2. So d0 can be found between hypotheses. The curvature gives the
+standard deviation of d0, sqrt(a / (n q)), in the same unit as d.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from rig.simd import Bools, Float32
 
 BLOCK_PX: Final = (9, 11)
-"""Rows and pixels of a block; its ends are cut where rows that follow each other end."""
+"""Rows and pixels of a block; it is cut where neighbouring rows are not measured."""
 ROWS_AT_ONCE: Final = 48
 """Rows that are matched together; bounds the memory to some tens of megabytes."""
 LAGS_PX: Final = 3
@@ -37,12 +38,14 @@ EXPOSED: Final = 0.7
 BRIGHTEST: Final = 99.5
 """Percentile of the pixels that counts as the brightest."""
 MOST_EXPOSURES: Final = 64
-"""Number of exposures that are added up; more are not taken."""
+"""Largest number of exposures that are added up."""
 
 
 class Matches(NamedTuple):
-    """Best hypothesis of each pixel, float32 (rows, width): place, fractional, NaN where the block shows nothing; sd,
-    the standard deviation of the place if it is the right one; confidence that it is, 0 to 1.
+    """Best hypothesis of each pixel, float32 (rows, width).
+
+    place: fractional index of the hypothesis, NaN where the block shows nothing. sd: standard deviation of the place if
+    the hypothesis is right. confidence: probability that it is right, 0 to 1.
     """
 
     place: Float32
@@ -51,8 +54,10 @@ class Matches(NamedTuple):
 
 
 def bands(rows: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Rows that are matched together, as slices of `rows`: those that follow each other in the picture, with half a
-    block more than needed on either side where there are some; and of these the ones that are needed.
+    """Pairs of slices: of `rows`, the rows that are matched together; and of these, the rows whose result is kept.
+
+    Rows that are matched together are neighbours in the picture. Half a block of rows on either side is added to those
+    whose result is kept, where there are such rows.
     """
     ends = np.flatnonzero(np.diff(rows) != 1) + 1
     margin = BLOCK_PX[0] // 2
@@ -67,10 +72,10 @@ def bands(rows: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 def exposed(
     take: Callable[[int, float], NDArray[np.uint16]], frame_s: float, time_s: float, full_scale: int
 ) -> Float32:
-    """A picture (...) taken within a time, as the sum of exposures that do not saturate.
+    """Take a picture (...) within a time, as the sum of exposures that do not saturate.
 
-    take(n, exposure_s) returns n pictures (n, ...). The first one has the shortest exposure, frame_s, and tells how
-    long the others may be. time_s: at least frame_s.
+    take(n, exposure_s) returns n pictures (n, ...). The first one has the shortest exposure, frame_s, and shows how
+    long the others may be. time_s: time for all of them, at least frame_s.
     """
     if time_s < 2 * frame_s:
         return np.asarray(take(1, max(time_s, frame_s))[0], np.float32)
@@ -88,8 +93,8 @@ def match(picture: Float32, references: Iterator[tuple[Float32, Bools]], indepen
     (hypotheses, rows, width).
 
     picture: (rows, width). references: for each hypothesis its picture and the pixels (rows, width) at which it is
-    possible. independent: number of independent values of a block. What is not possible leaves all, and its factor's
-    logarithm is -inf.
+    possible. independent: number of independent values of a block. Where a hypothesis is not possible the share is 1
+    and the logarithm -inf.
     """
     mean, spread = _moments(picture)
     left, evidence = [], []
@@ -106,11 +111,11 @@ def match(picture: Float32, references: Iterator[tuple[Float32, Bools]], indepen
 
 
 LEAST_LEFT: Final = np.float32(1e-5)
-"""Least share of the variance that a match leaves: float32 tells no less apart."""
+"""Least share of the variance that a match leaves: float32 cannot resolve less."""
 
 
 def log_bayes_factor(left: Float32, independent: float) -> Float32:
-    """Logarithm of the Bayes factor above, for the share `left` = 1 - r^2, 0 to 1, and n independent values."""
+    """Logarithm of the Bayes factor B of the module's docstring. left: 1 - r^2, 0 to 1. n: of independent values."""
     n = max(independent, 3.0)
     return np.asarray(0.5 * (n - 2) * np.log1p(n) - 0.5 * (n - 1) * np.log1p(n * left), np.float32)
 
@@ -134,11 +139,11 @@ def independent_values(picture: Float32, reference: Float32) -> float:
 def best_match(
     left: Float32, evidence: Float32, independent: float, step_px: float, at: NDArray[np.int64] | None = None
 ) -> Matches:
-    """The best hypothesis of each pixel. left, evidence: as of `match`. step_px: pixels of disparity between two
-    hypotheses. at: (rows, width) of given hypotheses, of which the confidence is asked; the best by default.
+    """The best hypothesis of each pixel. left, evidence: results of `match`. step_px: pixels of disparity between two
+    hypotheses. at: hypotheses (rows, width) that are judged instead of the best ones.
 
-    Where a block lies over a depth edge, it matches the surface with more contrast, and its middle may lie on the
-    other one. So where confident answers within a block are more than `EDGE_PX` apart, either surface has even odds.
+    A block over a depth edge matches the surface with more contrast, while its middle may lie on the other surface. So
+    if confident answers within a block are more than `EDGE_PX` apart, the confidence is halved.
     """
     number = len(evidence)
     peak = np.argmax(evidence, axis=0)

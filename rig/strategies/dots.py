@@ -1,13 +1,13 @@
 """Dots: one picture of a known random pattern, matched block by block along the row, as in the first Kinect.
 
-The projector shows dots at random places. For each of many inverse depths the pattern is laid over the picture as
-surfaces at this depth would show it, from the calibrated columns, and compared block by block
-(`rig.strategies.block_matching`). Nothing is averaged over time but light: the same pattern is shown all the time, so
-one exposure is enough, and what moves is caught as it is.
+The projector shows dots at random places. For each of many inverse depths, the calibrated columns tell how the pattern
+would look on surfaces at this depth. The picture is compared with that block by block
+(`rig.strategies.block_matching`). The same pattern is shown all the time, so one exposure is enough, even for a scene
+that moves.
 
-In fog each row has a haze of its own, the sum of what its dots light before the surface. It changes little from pixel
-to pixel, but from one row of dots to the next. So each row's mean over the width of a block is taken off, in the
-picture and in the pattern alike.
+In fog each row has a haze of its own: the light that fog in front of the surface sends back from the row's dots. It
+hardly changes from pixel to pixel, but it does from one row of dots to the next. So the mean of each row over the width
+of a block is subtracted, both in the picture and in the pattern.
 
 With white noise of standard deviation s in each pixel and the picture's slope g along the row, the position of a block
 has at least the error of the Cramer-Rao bound, s / sqrt(sum of g^2 over the block).
@@ -27,23 +27,23 @@ from rig.strategies.lidar import RIGHT, within
 from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
 
 DOT_ROWS, DOT_COLUMNS = 2, 2
-"""Size of a dot: about two pixels, as large as the picture of a point of Kinect's on its sensor."""
+"""Rows and columns of a dot: about two pixels, as large as a dot of Kinect in the picture of its camera."""
 LIT: Final = 0.25
 """Share of the places of the pattern that are lit."""
 STEP_PX: Final = 1 / 3
 """Distance between neighbouring hypotheses, in pixels of disparity."""
 NODES: Final = 33
-"""Inverse depths at which the columns of all pixels are solved for; between them they are interpolated linearly, with
+"""Number of inverse depths at which the column of each pixel is computed. In between it is interpolated linearly, with
 an error of a hundredth of a column."""
 FINE: Final = 8
-"""Parts of a column at which the blurred pattern is sampled."""
+"""Number of places in a column at which the blurred pattern is sampled."""
 BLUR_COLUMNS: Final = 0.6
 """Standard deviation of the blur of a dot by projector and lens, in columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dots:
-    """Dots seen by one of the two cameras."""
+    """Dots, seen by the SPAD array or by the conventional camera."""
 
     name: str
     sentence: str
@@ -53,8 +53,8 @@ class Dots:
     light: Light = "pattern"
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """See `Strategy`. All of the time is one picture; the conventional camera adds several exposures if one
-        would saturate. rng_seed: of the pattern.
+        """See `Strategy`. All of the time is used for one picture. If one exposure of the conventional camera would
+        saturate, several are added. rng_seed: of the pattern.
         """
         frame_s = apparatus.spad_frame_s if self.camera == "spad" else apparatus.camera_frame_s
         if budget.time_s < frame_s * (1 - 1e-9):
@@ -82,7 +82,7 @@ def dot_pattern(rows: int, columns: int, seed: int) -> Float32:
 
 
 def depth_of_dots(picture: Float32, shown: Float32, geometry: ColumnGeometry) -> Answer:
-    """Depth of a picture (rows, width) of a pattern (rows, columns) that differs from row to row."""
+    """Depth from a picture (rows, width) of a pattern (rows, columns)."""
     near_m, far_m = geometry.depth_range_m
     low, high = (1 - BEYOND) / far_m, (1 + BEYOND) / near_m
     number = max(int(np.ceil(geometry.px_per_inverse_depth * (high - low) / STEP_PX)), 2) + 1

@@ -1,22 +1,23 @@
 """Flash time of flight on a SPAD array: the whole picture is lit by pulses, and every pixel times its first photon.
 
-A photon that comes at time t after the middle of its pulse tells of a surface at the range c t / 2. Four ways to make
-a depth of a pixel's photon times, each pixel by itself:
+A photon that arrives at time t after the middle of its pulse comes from the distance c t / 2. There are four ways to
+compute the depth of a pixel from the times of its photons:
 
 - first photon (Kirmani et al., "First-photon imaging", Science 343, 2014, without its smoothing over neighbours): the
   time of the very first photon is the answer. Further photons are not used, so its error does not fall with time.
-- peak: histogram of all first photons of all pulses, a matched filter, and its largest value.
-- Coates (J. Phys. E 1, 1968): the same after correction of the pile-up: a pixel is blind after its first photon.
+- peak: the first photons of all pulses make a histogram. The answer is where its matched filter is largest.
+- Coates (J. Phys. E 1, 1968): the same after correction of the pile-up: after its first photon a pixel is blind until
+  the next pulse.
 - gamma (Satat, Tancik and Raskar, "Towards photography through realistic fog", ICCP 2018): light of the fog is fitted
-  by a gamma distribution a t^b exp(-c t), and the peak is sought in what exceeds it. Light that is scattered once
-  follows the lidar equation, which is this with b = -2 and c = speed of light x extinction. Pile-up is corrected
-  before that, since it deforms the distribution.
+  by a gamma distribution a t^b exp(-c t), and the peak is sought in the light that exceeds it. Light that is scattered
+  once follows the lidar equation, which is this distribution with b = -2 and c = speed of light x extinction. Pile-up
+  is corrected first, since it deforms the distribution.
 
 If a pulse gives F photons from the fog before a surface and S from the surface, on average, the first photon that is
 detected comes from the surface with the probability exp(-F) (1 - exp(-S)) / (1 - exp(-F - S)).
 
-Confidence is the probability that the answer is within 2 % of the depth: that the peak is a surface
-(`rig.strategies.photon_times`), times that its error is small enough.
+Confidence is the probability that the answer is within 2 % of the depth. It is the probability that the peak is a
+surface (`rig.strategies.photon_times`), times the probability that its error is small enough.
 """
 
 import math
@@ -33,20 +34,22 @@ from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
 LIGHT_M_PER_S: Final = 299792458.0
 """Speed of light, exact by definition of the SI."""
 BINS_PER_SIGMA: Final = 1.0
-"""Bins per standard deviation of the pulse. Their width squared over 12 adds to its variance: 4 % of the error."""
+"""Bins per standard deviation of the pulse. A twelfth of the squared width of a bin adds to the pulse's variance, which
+makes the error 4 % larger."""
 RIGHT: Final = 0.02
 """Share of the depth within which an answer counts as right."""
 NEIGHBOURS: Final = 8
-"""Pixels to either side whose first photons say whether a pixel's own came from a surface."""
+"""Pixels on either side whose first photons say whether the first photon of a pixel came from a surface."""
 NEAR_SIGMAS, AROUND_SIGMAS = 3.0, 15.0
-"""Photons of one surface differ by sqrt(2) standard deviations of the pulse; light of fog is spread over many."""
+"""Differences of arrival times, in standard deviations of the pulse, within which two photons agree, and within which
+chance agreement is counted. Two photons of one surface differ by sqrt(2); light of fog is spread over many."""
 
 Method = Literal["first-photon", "peak", "gamma"]
 
 
 @dataclass(frozen=True, slots=True)
 class FlashLidar:
-    """A flash lidar with one of the ways above to make a depth of the times. coates: whether pile-up is corrected."""
+    """A flash lidar. method: how it computes the depth, see above. coates: whether pile-up is corrected."""
 
     name: str
     sentence: str
@@ -57,7 +60,7 @@ class FlashLidar:
     light: Light = "flash"
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """See `Strategy`. All of the time is spent on pulses, one for each frame of the SPAD."""
+        """See `Strategy`. All of the time is used for pulses, one in each frame of the SPAD."""
         pulses = int(budget.time_s / apparatus.spad_frame_s * (1 + 1e-9))
         if pulses < 1:
             raise TooShort(f"{self.name} needs {apparatus.spad_frame_s:g} s for one pulse")

@@ -1,14 +1,15 @@
-"""Line scans: a line of light, or a few, step over the scene; a SPAD array or a conventional camera looks at them.
+"""Line scans: one or more lines of light step over the scene, and a SPAD array or a conventional camera looks at them.
 
 With the SPAD this is the scanner of this program itself: counts of each column go through the same estimators and the
 same depth maps as those of a scan (`rig.depth.reconstruct`). One frame in twenty is dark, as in a scan. If there are
-fewer frames than columns, the line moves on by several columns within a frame, as a mirror that does not stop: all of
-them are lit together. Several lines share the light, and each place of theirs gets as many times more frames.
+fewer frames than columns, the line passes several columns within a frame, as with a mirror that does not stop, and all
+of them are lit together. Several lines share the light. Each of them has fewer places to go to, so each place gets more
+frames.
 
-The conventional camera (`LineCamera`) takes an image for each place of the line, which steps and stands still. On every
-row the brightest pixel above the pixel's own median over all images is refined to the centroid of the pixels beside it
-(Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996). Noise is measured in the images
-themselves.
+The conventional camera (`LineCamera`) takes an image for each place of the line, which stands still meanwhile. Each
+pixel's median over all images is subtracted. On every row the brightest pixel is then refined to the centroid of the
+pixels beside it (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996). Noise is measured
+in the images themselves.
 """
 
 import math
@@ -36,23 +37,23 @@ LEAST_PLACES: Final = 32
 AT_ONCE: Final = 64
 """Columns whose counts are in memory at the same time before they are cut to the search windows."""
 MIN_CONFIDENCE: Final = 0.5
-"""Answers below it do not enter a depth map, as in a scan."""
+"""Answers with a lower confidence do not enter a depth map, as in a scan."""
 
 
 def frames_within(budget: Budget, frame_s: float) -> int:
-    """Number of whole frames within a budget; a part of a millionth that rounding takes is given back."""
+    """Number of whole frames within a budget. A frame that is too long by a millionth, from rounding, is whole."""
     return math.floor(budget.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 
 def shares(frames: int, places: int) -> NDArray[np.int64]:
-    """So many frames for each place (places,) that they add up to `frames` and differ by one at most."""
+    """Number of frames at each place, (places,). They add up to `frames` and differ by one at most."""
     result: NDArray[np.int64] = np.diff(np.arange(places + 1) * frames // places)
     return result
 
 
 @dataclass(frozen=True, slots=True)
 class LinePlaces:
-    """Places at which a line stands. of: (columns,), each column's place. commands: (places,), their middles."""
+    """Places at which a line stands. of: place of each column, (columns,). commands: their middles, (places,)."""
 
     of: NDArray[np.int64]
     commands: Float64
@@ -69,7 +70,7 @@ class LinePlaces:
 
 
 def places_of(commands: Float64, most: int) -> LinePlaces:
-    """At most `most` places, all of the same number of neighbouring columns but the last one."""
+    """At most `most` places. Each has the same number of neighbouring columns, except the last one."""
     together = -(-len(commands) // most)
     of = np.arange(len(commands)) // together
     return LinePlaces(of, np.bincount(of, weights=commands) / np.bincount(of))
@@ -103,7 +104,7 @@ class LineScan:
         return f"SPAD array and {many} of light, the stripe found by the estimator {self.estimator}{filtered}."
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once, see `Strategy`. The number of columns must be a multiple of the lines, else ValueError."""
+        """Measure once (see `Strategy`). Raises ValueError if the number of columns is not a multiple of the lines."""
         if geometry.columns % self.lines:
             raise ValueError(
                 f"{geometry.columns} columns are no multiple of {self.lines} lines; give the apparatus "
@@ -178,7 +179,7 @@ class LineCamera:
     clear_px: float = 0.3
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once, see `Strategy`: as many places of the line as there are images in the time."""
+        """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time."""
         most = frames_within(budget, apparatus.camera_frame_s)
         if most < LEAST_PLACES:
             raise TooShort(f"{self.name} needs {LEAST_PLACES * apparatus.camera_frame_s * 1e3:.3g} ms")
@@ -200,12 +201,12 @@ class LineCamera:
 def peak_centroids(images: NDArray[np.uint16], geometry: SweepGeometry, full_scale: int) -> StripeTable:
     """Stripe table from images (columns, rows, width) of a conventional camera with the line at each column.
 
-    A pixel's own median over all images is subtracted: ambient light and offset. The brightest pixel within the search
-    window (the middle one of a saturated run) is refined to the centroid of it and CENTROID_PX pixels on each side.
-    Noise: of a dark pixel, from its median absolute deviation over the images; of a bright one, more by its photons,
-    whose number per step is learned from how the variance grows with brightness. Confidence: probability that noise
-    has made no other pixel of the window so bright, and that no other place on the row is as bright. x_sd_px: the
-    noise's share in the centroid, never less than 0.05 px.
+    The median of each pixel over all images is subtracted: it is ambient light and offset. The position is the centroid
+    of the brightest pixel within the search window (the middle one, if several in a row are saturated) and CENTROID_PX
+    pixels on each side. The noise of a dark pixel is its median absolute deviation over the images. A bright pixel has
+    shot noise too, which is learned from the growth of the variance with brightness. Confidence is the probability that
+    noise has made no other pixel of the window so bright, and that no other place on the row is as bright. x_sd_px is
+    the error of the centroid because of noise, at least 0.05 px.
     """
     columns, rows, width = images.shape
     dark = np.median(images, axis=0).astype(np.float32)
@@ -271,7 +272,7 @@ def _sure(top: Float32, second: Float32, noise: Float32, variance: Float32, cand
 
 
 CLEAR_PX: Final = {1: 0.2, 2: 1.5, 4: 1.5, 8: 8.0}
-"""Largest median error by number of lines: where search windows overlap, an answer may be another line's stripe."""
+"""Largest median error by number of lines. Where search windows overlap, an answer may be another line's stripe."""
 
 
 def _spad(estimator: str, lines: int = 1) -> LineScan:

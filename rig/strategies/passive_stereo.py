@@ -1,17 +1,17 @@
 """Passive stereo: two cameras in ambient light, matched by OpenCV's semi-global matcher (StereoSGBM).
 
-The second camera stands where the light source of the others is, so that the baseline is the same. A point at depth z
-is seen with a disparity d = b f / z, and an error of the disparity becomes an error of the depth of
+The second camera stands where other strategies have their light source, so the baseline is the same. A point at depth z
+is seen with a disparity d = b f / z. An error dd of the disparity becomes an error of the depth of
 
     dz = z^2 / (b f) dd.
 
-The matcher finds disparities in sixteenths of a pixel, and its interpolation draws them to whole pixels by up to some
-hundredths of one. Pictures of cameras that do not stand side by side, or have lenses that distort, are rectified by
-OpenCV first.
+The matcher finds disparities in sixteenths of a pixel, but they lie up to 0.2 px too close to whole pixels. So the
+place between whole pixels is taken from the blocks around a pixel (`rig.strategies.block_matching`), and so is the
+confidence. The matcher's preference for smooth surfaces has no part in either. If the cameras do not stand side by
+side, or if the lens distorts, the pictures are first rectified by OpenCV.
 
-Fog lowers the contrast of both pictures and adds its own smooth light. So pictures are given to the matcher without
-their local mean, stretched to 8 bits. How far a disparity is to be believed is told by both pictures' blocks
-(`rig.strategies.block_matching`), without the matcher's smoothness.
+Fog lowers the contrast of both pictures and adds smooth light of its own. So the local mean is subtracted from the
+pictures before the matcher gets them, and the rest is stretched to 8 bits.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ MATCHED_BLOCK_PX: Final = 5
 SMOOTHNESS: Final = (8, 32)
 """Penalties P1 and P2 per pixel of the block, as OpenCV recommends."""
 UNIQUENESS_PERCENT: Final = 5
-"""Per cent by which the best cost must be below the second best, as OpenCV recommends: 5 to 15."""
+"""Percentage by which the best cost must be below the second best; OpenCV recommends 5 to 15."""
 DETAIL_PX: Final = 4.0
 """Standard deviation of the Gaussian that gives the local mean."""
 FULL_SIGMAS: Final = 3.0
@@ -44,15 +44,16 @@ SUB_PIXEL_PX: Final = 0.1
 """Standard deviation of the matcher's interpolation between whole pixels (Shimizu and Okutomi, ICCV 2001: its error
 goes up to 0.15 px)."""
 ALIGNED: Final = 1e-4
-"""Offset of the second camera up, down or ahead, over the baseline, below which rows are the same in both pictures: a
-tenth of a pixel in a thousand."""
+"""Offset of the second camera up, down or ahead, divided by the baseline. Below it rows are the same in both pictures,
+to a tenth of a pixel in a thousand."""
 
 
 class Rectified(NamedTuple):
-    """A way to make rectified pictures of raw ones. focal_baseline: b f in pixels times metres, with the sign of the
-    second camera's side: positive if it stands on the right. maps: of `cv2.remap` for both cameras; None where the
-    pictures are rectified as they are. turn: (3, 3), from the camera's frame to the rectified one. matrix: (3, 3) of
-    the rectified camera.
+    """How pictures of two cameras are rectified.
+
+    focal_baseline: b f in pixels times metres, positive if the second camera stands on the right of the first, else
+    negative. maps: for `cv2.remap`, of both cameras; None if the pictures need no change. turn: rotation (3, 3) from
+    the camera's frame to the rectified one. matrix: (3, 3) of the rectified camera.
     """
 
     focal_baseline: float
@@ -62,8 +63,10 @@ class Rectified(NamedTuple):
 
 
 def rectified(model: RigModel) -> Rectified:
-    """The way to rectify the pictures of a rig. Raises UsageError if the rig does not say where its source stands, or
-    if this is not mainly beside the camera."""
+    """How the pictures of a rig are rectified.
+
+    Raises UsageError if the rig does not say where its source is, or if the source is not mainly beside the camera.
+    """
     camera, second = model.camera, model.source_m
     if second is None or abs(second[0]) <= np.hypot(second[1], second[2]):
         raise UsageError(
@@ -92,7 +95,7 @@ class PassiveStereo:
     light: Light = "ambient"
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """See `Strategy`. The time is that of both cameras, which expose together; nothing is random here."""
+        """See `Strategy`. Both cameras expose at the same time. Nothing is random here."""
         frame_s = apparatus.camera_frame_s
         if budget.time_s < frame_s * (1 - 1e-9):
             raise TooShort(f"{self.name} needs {frame_s:g} s for one exposure")
@@ -104,7 +107,7 @@ class PassiveStereo:
 
 
 def depth_of_pair(pair: Float32, geometry: ColumnGeometry) -> Answer:
-    """Depth of two pictures (2, rows, width), on the pixels of the first camera."""
+    """Depth from two pictures (2, rows, width), for the pixels of the first camera."""
     how = rectified(geometry.model)
     rows = geometry.rows
     if how.maps is not None:

@@ -1,7 +1,7 @@
-"""Measures with every way to measure depth in front of the same scenes, and tabulates how well each one did.
+"""Measures the same scenes with every strategy, that is, in every way to measure depth, and tabulates the results.
 
-Every measurement has the same camera, the same power of its source, the same ambient light and the same time. Each
-seed makes all of them anew. A row is one way in one scene, air, rule and time.
+Every measurement has the same camera, the same power of its source, the same ambient light and the same time. All are
+repeated with each seed. A row of the table is one strategy in one scene and air, with one rule and time.
 """
 
 import math
@@ -34,28 +34,28 @@ from rig.tradeoff.effects import open_world
 LINES: Final = 8
 """The number of columns is a multiple of this, so that as many lines can share them."""
 OVERSPENT: Final = 1e-6
-"""Share of the time by which a measurement may exceed it, for rounding."""
+"""Share by which a measurement may exceed its time, because of rounding."""
 REACHED: Final = 0.9
 """Share of a distance's pixels that must be good for the distance to be reached."""
 BINS_PER_E: Final = 10.0
 """Bins of distance, per factor of e: 10 % wide."""
 FEWEST: Final = 30
-"""Pixels that a bin of distance needs to count."""
+"""Least number of pixels in a bin of distance; a bin with fewer is not used."""
 PULSE_S: Final = 1e-10
 """Length of a flash, for its laser class only."""
 GREEN_M: Final = 520e-9
 WIDE_FAN_RAD: Final = math.radians(50)
 
 PROTECTED: Final = "simulation for comparison only"
-"""Words in the sentence of a strategy whose patterns are protected by others; they are said when it runs."""
+"""Words in the sentence of a strategy whose patterns others have protected; the sentence is shown when it runs."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonPlan:
     """Scenes, air, times and rules of a comparison.
 
-    times_s: of a measurement. rows: number of image rows in the middle of the picture. lux: ambient light, None for
-    each scene's own. airs: None is a scene's own.
+    airs: fog, rain, snow or clear air; None for a scene's own. times_s: time of a measurement. rows: number of image
+    rows, from the middle of the picture. lux: ambient light; None for each scene's own.
     """
 
     scenes: Sequence[str]
@@ -69,14 +69,14 @@ class ComparisonPlan:
 
 @dataclass(frozen=True, slots=True)
 class StrategyRow:
-    """One way to measure depth in one scene and air, by one rule, within one time; means over all seeds.
+    """One strategy in one scene and air, by one rule, within one time; means over all seeds.
 
     air: a visibility, clear, rain or snow; None for the scene's own. mean_px, median_px, good, valid, confident_wrong:
-    as in `Score`; None if the way cannot measure in so short a time, which `too_short` then says. spread_px: standard
-    deviation of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance
-    at which 90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms, energy_mj: sensor time and
-    light. compute_s: seconds of the computer, simulation included. laser_class, laser_class_still: of the source while
-    it works, and if it stood still; None without a source.
+    as in `Score`; None if the strategy needs more time. `too_short` then says how much. spread_px: standard deviation
+    of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance at which
+    90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms: sensor time. energy_mj: energy of
+    the light. compute_s: computing time, simulation included. laser_class, laser_class_still: of the source while it
+    works, and if it stood still; None without a source.
     """
 
     strategy: str
@@ -104,8 +104,11 @@ class StrategyRow:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Result of a comparison: all rows. verdict: 'aborted' if an interrupt ended it; the rows are then those that were
-    complete. sentences: what each way does. notes: what has to be said of some ways. folder: where it was written."""
+    """Result of a comparison.
+
+    rows: those that are complete. verdict: 'aborted' if an interrupt ended it. sentences: what each strategy does, by
+    its name. notes: lines that must be shown with the result. folder: where it was written.
+    """
 
     rows: tuple[StrategyRow, ...]
     sentences: Mapping[str, str]
@@ -141,8 +144,8 @@ def run_comparison(
 ) -> Comparison:
     """Measure with all strategies and tabulate. progress: called with the number of measurements done and the total.
 
-    Raises UsageError if a scene cannot be used, and RigError if a strategy takes more time than it has. An interrupt
-    ends the comparison after the last complete row; before the first one it is raised again.
+    Raises UsageError if a scene cannot be used, and RigError if a strategy takes more time than it has. After an
+    interrupt the complete rows are returned; if there is none, the interrupt is raised again.
     """
     rows: list[StrategyRow] = []
     verdict: Literal["complete", "aborted"] = "complete"

@@ -43,8 +43,8 @@ VISIBLE_M: Final = (400e-9, 700e-9)
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """Light that enters a pupil at 100 mm. power_w: while it is in. pulse_s: for how long; rate_hz: how often; a beam
-    that stays in has an infinite pulse_s, and then the rate means nothing."""
+    """Light that enters a pupil at 100 mm. power_w: power while it enters. pulse_s: how long it enters at a time.
+    rate_hz: how often. If it enters all the time, pulse_s is infinite and rate_hz is not used."""
 
     power_w: float
     pulse_s: float = math.inf
@@ -133,17 +133,17 @@ class Field:
         return min(1.0, math.pi / 4 * PUPIL_RAD**2 / (self.fan_rad * self.scan_rad))
 
     def spot(self, map_s: float, rows: int) -> tuple[Beam, Beam]:
-        """A spot that scans `rows` rows in `map_s`, again and again; and one that stands still."""
+        """Beams of a spot that scans `rows` rows in `map_s`, again and again, and of one that stands still."""
         passes = max(1.0, rows * self.along)
         return Beam(self.power_w, map_s / rows * self.across, passes / map_s), Beam(self.power_w)
 
     def line(self, map_s: float) -> tuple[Beam, Beam]:
-        """A line that scans the field in `map_s`, again and again; and one that stands still."""
+        """Beams of a line that scans the field in `map_s`, again and again, and of one that stands still."""
         power_w = self.power_w * self.along
         return Beam(power_w, map_s * self.across, 1 / map_s), Beam(power_w)
 
     def pattern(self) -> tuple[Beam, Beam]:
-        """A projector's picture with half of its columns lit: the pupil may lie in lit columns alone."""
+        """Beam of a projector's picture with half of its columns lit, for a pupil that lies in lit columns only."""
         beam = Beam(min(2 * self.of_picture, 1.0) * self.power_w)
         return beam, beam
 

@@ -1,7 +1,8 @@
 """Writes the files of a comparison: strategies.json, strategies.csv and two pictures.
 
 `strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility. Both
-show one way of each kind, the best; kinds are told by the first word of a name, and by what sees the light.
+show the best strategy of each kind. Strategies are of one kind if the first word of their names and their sensor (SPAD
+or conventional camera) are the same.
 """
 
 import csv
@@ -26,7 +27,7 @@ CAMERA: Final = "camera"
 CLEAR_AT_M: Final = 300.0
 """Place of clear air on the axis of visibility."""
 SHOWN_MS: Final = 50.0
-"""Time of the picture over visibility; the nearest of those that were measured."""
+"""Time of measurement in the picture over visibility: the measured time that is nearest to it is shown."""
 
 
 def write_files(folder: RunFolder, done: Comparison) -> Comparison:
@@ -55,7 +56,8 @@ def kind_of(strategy: str) -> str:
 
 
 def best_of_kinds(rows: Sequence[StrategyRow]) -> list[str]:
-    """The strategy of each kind with the least mean error over all rows; no measurement counts as missing answers."""
+    """The strategy of each kind with the least mean error over all rows. A row without a measurement counts as if all
+    its answers were missing."""
     errors: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         error = MISSING_PX if row.mean_px is None else row.mean_px

@@ -1,8 +1,8 @@
 """Scenes in different air, as files that a simulated world reads: fog of a visibility, rain, snow, or clear air.
 
-A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall that recedes from 1.2 to 14 m, with
-random texture, on which every distance can be tried. Air replaces what the scene has in its own; ambient light is the
-scene's own, or that of the bundled scenes where it has none.
+A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall with random texture that recedes from
+1.2 to 14 m, so that every distance is there. The air that is asked for replaces fog, rain and snow of the scene.
+Ambient light is that of the scene; a scene without any gets that of the bundled scenes.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ WEATHER: Final[dict[str, dict[str, Any]]] = {
 }
 """Air by name: heavy rain and moderate snow, as in the bundled scenes."""
 USUAL_LUX: Final = 5.0
-"""Ambient light of a scene that has none of its own, that of the bundled scenes: a street at night."""
+"""Ambient light, in lux, of a scene that states none. The bundled scenes have it: a street at night."""
 RAMP: Final = "ramp"
 RAMP_M: Final = (1.2, 14.0)
 TEXTURE_PX: Final = 6
@@ -35,7 +35,7 @@ ALBEDO: Final = (0.2, 0.8)
 
 
 def air_problems(airs: "list[str] | tuple[str, ...]") -> list[str]:
-    """A line for each air that is none."""
+    """A line for each name that is not an air, saying why."""
     problems = []
     for air in airs:
         if air == CLEAR or air in WEATHER:

@@ -1,9 +1,9 @@
 """Scores an answer against the truth, by the same rules for every way to measure depth.
 
-Scored are the pixels that camera and source both see, within the depth range, where the scene's depth was measured and
-not guessed. The error in pixels is that of the disparity, b f |1/z - 1/z_true|: the same unit for all, whether they
-triangulate or time. A missing answer, and a larger error, count as `MISSING_PX`, so that leaving answers out does not
-help.
+A pixel is scored if camera and source both see its surface, if the surface is within the depth range, and if the
+scene's depth was measured there and not guessed. The error in pixels is that of the disparity, b f |1/z - 1/z_true|:
+the same unit for all strategies, those by triangulation and those by time of flight. A missing answer counts as
+`MISSING_PX`, and so does a larger error. So it is no advantage to leave out answers.
 """
 
 from dataclasses import dataclass
@@ -17,20 +17,21 @@ from rig.simd import Bools
 from rig.strategies.strategy import Answer, ColumnGeometry
 
 GOOD: Final = 0.02
-"""Share of the depth by which a good answer may be off."""
+"""Largest error of a good answer, as a share of the depth."""
 CONFIDENT: Final = 0.9
-"""Confidence from which an answer claims to be right."""
+"""Least confidence of a confident answer."""
 SAME_PX: Final = 1.5
 """Largest distance of a pixel from the true stripe of the nearest columns if the source sees the pixel's surface."""
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """pixels: number of scored ones. mean_px: mean error of all of them, missing ones and larger errors as MISSING_PX.
+    """Score of an answer.
 
-    median_px, median_m: median error of those with an answer, in pixels of disparity and in metres; None without any.
-    good, valid, confident_wrong: shares of all scored pixels: with an answer within 2 % of the depth, with any answer,
-    and with an answer of confidence 0.9 or more that is not within 2 %.
+    pixels: number of scored pixels. mean_px: mean error of all of them; a missing answer and a larger error count as
+    MISSING_PX. median_px, median_m: median error of the pixels with an answer, in pixels of disparity and in metres;
+    None if no pixel has one. good, valid, confident_wrong: shares of the scored pixels with an answer within 2 % of the
+    depth, with any answer, and with an answer of confidence 0.9 or more that is not within 2 %.
     """
 
     pixels: int

@@ -1,12 +1,13 @@
 """Plain binary codes and Gray codes: each pattern tells one bit of the column, most significant first.
 
-A bit is read against the middle between lit and dark. With inverse patterns each pair tells its own middle (K. Sato, S.
-Inokuchi, "Three-dimensional surface measurement by space encoding range imaging", J. Robotic Systems 2, 1985). Alone,
-the finest pattern is followed by its inverse, and the two tell the middle for all; they are shown longer, since their
-noise enters every bit. Neighbouring columns differ in one bit of a Gray code, so a pixel on a border is at most a
-column off, where a plain code may jump. Borders are found to a fraction of a pixel where the bit that changes crosses
-its middle (M. Trobina, "Error model of a coded-light range sensor", ETH Zurich BIWI-TR-164, 1995), and columns are
-interpolated between them. The code repeats after as many columns as the depth range can need.
+A bit is 1 if the pixel is brighter than the middle between lit and dark. If each pattern is shown with its inverse,
+each pair has its own middle (K. Sato, S. Inokuchi, "Three-dimensional surface measurement by space encoding range
+imaging", J. Robotic Systems 2, 1985). Otherwise only the finest pattern has its inverse, and these two give the middle
+for all; they are shown longer, since their noise enters every bit. The Gray code of neighbouring columns differs in one
+bit, so a pixel on a border is at most one column off; with a plain code the error may be large. A border lies where the
+bit that changes crosses its middle, to a fraction of a pixel (M. Trobina, "Error model of a coded-light range sensor",
+ETH Zurich BIWI-TR-164, 1995). Columns are interpolated between borders. The code repeats after as many columns as the
+depth range can need.
 """
 
 from dataclasses import dataclass
@@ -32,7 +33,8 @@ from rig.strategies.strategy import Answer, ColumnGeometry, Light
 Int64 = NDArray[np.int64]
 
 LONGEST_RUN_PX: Final = 6
-"""Borders of one column that lie farther apart belong to two surfaces, or one of them was not seen."""
+"""Largest distance of the two borders of a column. If they lie farther apart, they belong to two surfaces, or a border
+between them was missed."""
 QUANTISED_SD: Final = 12.0**-0.5
 """Standard deviation of a position that is known to lie within one column, in columns."""
 
@@ -67,15 +69,15 @@ def _bits_of(number: Int64, bits: int) -> Uint8:
 
 
 def bits_for(numbers: float) -> int:
-    """Bits of a code with at least so many numbers."""
+    """Number of bits of a code with at least so many numbers."""
     return max(int(np.ceil(np.log2(max(numbers, 2)))), 1)
 
 
 def gross_errors(contrast: Float64, sd: Float64, gray: bool, tolerated: int = 1) -> tuple[Int64, Float64]:
-    """Number (rows, width) that the bits tell, and the probability that it is off by no more than `tolerated`.
+    """Number (rows, width) that the bits encode, and the probability that it is off by no more than `tolerated`.
 
-    contrast, sd: (bits, rows, width), light above the middle and its standard deviation. Bits that are read wrong count
-    one at a time: where one alone moves the number no farther than tolerated, it does no harm.
+    contrast, sd: (bits, rows, width), light above the middle and its standard deviation. A bit does harm if its error
+    alone moves the number by more than `tolerated`. The probability is that all such bits are right.
     """
     number_of = gray_number if gray else plain_number
     bits = contrast > 0
@@ -92,9 +94,10 @@ def gross_errors(contrast: Float64, sd: Float64, gray: bool, tolerated: int = 1)
 
 
 def refined(number: Int64, contrast: Float64, sd: Float64) -> tuple[Float64, Float64]:
-    """Fractional number (rows, width) between the borders on either side along the row, and its standard deviation.
+    """Fractional number (rows, width), interpolated between the borders on either side in the row, and its standard
+    deviation.
 
-    Whole numbers stay where a border is missing or a column is more than `LONGEST_RUN_PX` wide.
+    Where a border is missing or a column is more than `LONGEST_RUN_PX` wide, the number stays whole.
     """
     period = 2 ** len(contrast)
     width = number.shape[1]
@@ -133,7 +136,7 @@ def refined(number: Int64, contrast: Float64, sd: Float64) -> tuple[Float64, Flo
 
 @dataclass(frozen=True, slots=True)
 class BinaryCode:
-    """Plain binary or Gray code, read with a SPAD or a conventional camera. inverse: every pattern with its inverse."""
+    """Plain binary or Gray code, read with a SPAD or a conventional camera. inverse: show the inverse patterns too."""
 
     name: str
     sentence: str

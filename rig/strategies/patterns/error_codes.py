@@ -5,15 +5,20 @@ patterns, and protects the column's code against missed photons and ambient ligh
 subject of the patent application US 2023/0410333; this is written from the idea alone, to compare ways to measure depth
 in simulation, and drives no projector.
 
-Each column has a code word: its Gray code many times over, with the inverse (`repetition`); a word of a BCH code (R. C.
-Bose, D. K. Ray-Chaudhuri 1960, A. Hocquenghem 1959); or, `hybrid`, a BCH word for its block of columns, and stripes as
-wide as a block that move by a column at a time for its place in there: these patterns are coarse, and a blurred
-projector shows them with full contrast. All words light a pixel about half of the time. So a bit is read as one where a
-pixel fired more often than on average, and no word has an advantage because it is darker.
+Each column has a code word:
 
-A decoder takes the word that differs in the fewest bits, or the likeliest one. The likelihood knows counts only: let a
-word say that n1 frames were lit, in which k1 photons came, and n0 were dark with k0. Whatever the probabilities p1 > p0
-of a photon in a lit and in a dark frame, all being equally likely,
+- `repetition`: its Gray code with the inverse, many times over;
+- `bch`: a word of a BCH code (R. C. Bose, D. K. Ray-Chaudhuri 1960, A. Hocquenghem 1959);
+- `hybrid`: a BCH word for the block of columns, and stripes for the column's place in the block. Stripes are as wide as
+  a block, and move by one column from pattern to pattern. These patterns are coarse, so even a blurred projector shows
+  them with full contrast.
+
+All words light a pixel about half of the time. So a bit is read as 1 if the pixel fired more often than in the mean of
+all patterns, and no word has an advantage because it is darker.
+
+A decoder takes the word that differs in the fewest bits, or the likeliest word. The likelihood uses the counts only.
+Suppose that, by a word, n1 frames were lit and n0 were dark, and that the pixel fired in k1 and k0 of them. If all
+probabilities p1 > p0 of firing in a lit and in a dark frame are equally likely beforehand, the word's likelihood is
 
     L = integral p1^k1 (1 - p1)^(n1 - k1) dp1  integral p0^k0 (1 - p0)^(n0 - k0) dp0
       = k1! (n1 - k1)! / (n1 + 1)!  k0! (n0 - k0)! / (n0 + 1)!
@@ -48,9 +53,10 @@ NOTICE: Final = "simulation for comparison only: such patterns are subject of US
 PRIMITIVE: Final = {4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001, 8: 0b100011101}
 """Primitive polynomial of the field with 2^m elements by m (S. Lin, D. J. Costello, "Error Control Coding", app. A)."""
 CODES: Final = {31: (11, 11), 63: (10, 27), 127: (15, 55), 255: (13, 119)}
-"""BCH codes with words enough for a projector: message bits, and bits in which two words differ at least, by length."""
+"""BCH codes with enough words for a projector, by length: number of message bits, and least number of bits in which two
+words differ."""
 MOST_REPEATED: Final = 13
-"""Repetitions of a Gray code; with pattern and inverse of 10 bits, thirteen are about as long as BCH(255, 13)."""
+"""Largest number of repetitions of a Gray code. With 10 bits and their inverse, it is about as long as BCH(255, 13)."""
 BLOCK: Final = 8
 """Columns of a block and of a stripe of `hybrid`."""
 LONGEST_HYBRID: Final = 127
@@ -114,7 +120,8 @@ def bch_words(length: int, message_bits: int, messages: NDArray[np.int64]) -> Ui
 
 
 def correctable(length: int, message_bits: int) -> int:
-    """Errors in a word that bounded decoding corrects: below half of the bits in which the nearest two words differ."""
+    """Number of errors in a word that bounded decoding corrects: less than half of the least number of bits in which
+    two words differ."""
     lightest = bch_words(length, message_bits, np.arange(1, 2**message_bits)).sum(axis=1, dtype=np.int64).min()
     return int(lightest - 1) // 2
 
@@ -135,10 +142,10 @@ def _balanced_words(length: int, numbers: int) -> Uint8:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodeBook:
-    """Code words (numbers, patterns), uint8, of columns; they repeat.
+    """Code words of columns, uint8 (numbers, patterns). Column c has the word c modulo the number of words.
 
-    same: (patterns,), the same number for patterns that are repetitions of each other. fine: patterns in which the
-    place between two columns shows, as all neighbours differ there in the same way.
+    same: (patterns,), the same number for patterns that are repetitions of each other. fine: patterns that show the
+    place between two columns, as all neighbouring columns differ there in the same way.
     """
 
     words: Uint8
@@ -147,10 +154,10 @@ class CodeBook:
 
 
 def code_book(kind: Words, numbers: int, frames: int) -> CodeBook:
-    """Code book for at least so many columns, after which it repeats, with at most so many patterns as frames.
+    """Code book with at least `numbers` words and at most `frames` patterns.
 
-    Of the codes that fit, the one whose words differ most in the frames that it uses of those there are, all patterns
-    getting equally many. Raises `TooShort` if even the shortest has more patterns.
+    All patterns of a code get the same number of frames. Of the codes that fit, the one is taken whose words differ in
+    the largest number of frames. Raises `TooShort` if even the shortest has more patterns than there are frames.
     """
     if kind == "repetition":
         bits = bits_for(numbers)
@@ -188,14 +195,15 @@ def _most_different(kind: str, codes: dict[int, tuple[int, int]], frames: int) -
 
 
 def packed(bits: NDArray[np.generic]) -> NDArray[np.uint64]:
-    """Bits (..., n) as words of 64 (..., ceil(n / 64)), padded with zeros."""
+    """Bits (..., n) packed into integers of 64 bits (..., ceil(n / 64)), padded with zeros."""
     padding = [(0, 0)] * (bits.ndim - 1) + [(0, -bits.shape[-1] % 64)]
     whole = np.packbits(np.pad(bits, padding).astype(np.uint8), axis=-1)
     return np.ascontiguousarray(whole).view(np.uint64)
 
 
 def differing_bits(received: NDArray[np.uint64], words: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Number of bits (pixels, words) in which received ones (pixels, n) differ from code words (words, n), packed."""
+    """Number of bits in which each received word (pixels, n) differs from each code word (words, n), both packed:
+    (pixels, words)."""
     result = np.zeros((len(received), len(words)), np.int64)
     for part in range(received.shape[1]):
         result += np.bitwise_count(received[:, None, part] ^ words[None, :, part])
@@ -203,12 +211,13 @@ def differing_bits(received: NDArray[np.uint64], words: NDArray[np.uint64]) -> N
 
 
 def log_factorials(most: int) -> Float64:
-    """ln n! for n = 0 to most."""
+    """Natural logarithms of n!, for n = 0 to `most`."""
     return np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, most + 1, dtype=np.float64)))])
 
 
 def log_evidence(counts: Int64, lit_frames: Int64, frames: int, total: Int64, table: Float64) -> Float64:
-    """The logarithm of L of the module's docstring, float64 like counts; -inf where lit frames fire more rarely.
+    """The logarithm of L in the module's docstring, float64, of the shape of counts. It is -inf where the pixel fired
+    in a smaller share of the lit frames than of the dark ones.
 
     counts: k1. lit_frames: n1. frames: n1 + n0. total: k1 + k0. The last three broadcast. table: `log_factorials` up to
     frames + 1.
@@ -221,14 +230,14 @@ def log_evidence(counts: Int64, lit_frames: Int64, frames: int, total: Int64, ta
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoder:
-    """Finds columns by their words. frames: of the SPAD for each pattern."""
+    """Finds columns by their words. frames: number of frames of the SPAD for each pattern."""
 
     book: CodeBook
     frames: int
 
     def nearest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
-        """Columns (width,) whose words differ in the fewest bits from what one row's pixels saw, the standard deviation
-        of the column, and the probability that it is right, from the counts. counts: (width, patterns)."""
+        """Columns of one row's pixels by the nearest words, standard deviations of the columns, and the probabilities
+        that they are right: (width,) each. The nearest word differs in the fewest bits. counts: (width, patterns)."""
         words, patterns = self.book.words, self.book.words.shape[1]
         bits = counts.astype(np.int64) * patterns > counts.sum(axis=1, dtype=np.int64, keepdims=True)
         place = window.best(-window.of(differing_bits(packed(bits), packed(words))))
@@ -237,7 +246,7 @@ class Decoder:
         return window.column(place), np.hypot(QUANTISED_SD, spread), right
 
     def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
-        """Return what `nearest` returns, for the likeliest words, and with the place between two columns."""
+        """The same as `nearest`, by the likeliest words. These columns are fractional."""
         evidence = window.of(self._evidence(counts))
         place = window.best(evidence)
         number = self._number(window, place)
@@ -299,7 +308,7 @@ def _in_lit(counts: NDArray[np.uint32], words: Uint8) -> Int64:
 
 @dataclass(frozen=True, slots=True)
 class ErrorCode:
-    """A code with a SPAD. likelihood: take the likeliest word instead of the nearest one."""
+    """An error-correcting code, read with a SPAD. likelihood: take the likeliest word instead of the nearest one."""
 
     name: str
     sentence: str

@@ -1,12 +1,13 @@
-"""Light that pixels see of each pattern, with its variance, and what all strategies with patterns make of it.
+"""Light that pixels see of each pattern, with its variance, and steps that all strategies with patterns share.
 
-One-bit counts of a SPAD become flux: of K frames N fired, so lambda = ln((K + 1/2) / (K - N + 1/2)) photons per frame,
-with the variance (N + 1/2) / ((K + 1) (K - N + 1/2)) (delta method on the binomial; the halves keep both finite for
-none and for all). Grey levels of a conventional camera have the variance alpha + beta level; read noise and gain are
-not told, so alpha and beta are fitted to how far the levels lie from what the decoded pattern lets expect.
+One-bit counts of a SPAD become flux. If N of K frames fired, it is lambda = ln((K + 1/2) / (K - N + 1/2)) photons per
+frame, with the variance (N + 1/2) / ((K + 1) (K - N + 1/2)) (delta method on the binomial; the halves keep both finite
+if no frame or every frame fired). Grey levels of a conventional camera have the variance alpha + beta level. Its read
+noise and gain are not known to a strategy. So alpha and beta are fitted to the differences between the levels and those
+expected of the decoded pattern.
 
-Every pattern that is shown lights about half of the columns, also where a reference is needed. So a column is equally
-bright in all of them, however the source shares its power.
+Every pattern lights about half of the columns, and so does a reference picture. So a lit column is equally bright in
+all of them, whatever the rule by which the columns share the power.
 """
 
 from collections.abc import Sequence
@@ -23,13 +24,13 @@ from rig.strategies.strategy import Answer, ColumnGeometry, TooShort
 
 Camera = Literal["spad", "camera"]
 ROUNDING: Final = 1e-9
-"""Relative: a budget of exactly n frames holds n of them although the quotient may be a little less."""
+"""Relative error of rounding that is allowed for: a budget of exactly n frames must hold n frames."""
 FILL: Final = 0.7
-"""Share of full scale that a test exposure puts its brightest pixels at."""
+"""Share of full scale that the brightest pixels may reach; a test exposure tells how long that takes."""
 BRIGHTEST: Final = 0.999
 """Quantile of the test exposure that counts as brightest: a few lamps and hot pixels may saturate."""
 NOISE_BINS: Final = 12
-"""Brightness classes in which a camera's noise is fitted."""
+"""Number of classes of brightness for the fit of a camera's noise."""
 ADC_VARIANCE: Final = 1.0 / 12.0
 """Variance of rounding to whole grey levels, the least that a camera's noise can be."""
 
@@ -39,7 +40,7 @@ class Levels:
     """Light that pixels saw of each pattern.
 
     light, variance: float64 (patterns, rows, width), in photons per frame of the SPAD, or grey levels of one exposure.
-    clipped: bool (rows, width), pixels that were at full scale in any of them.
+    clipped: bool (rows, width), pixels that were at full scale with any pattern.
     """
 
     light: Float64
@@ -78,10 +79,10 @@ def flux_of(counts: NDArray[np.uint32], frames: NDArray[np.int64]) -> tuple[Floa
 def measured(
     apparatus: Apparatus, camera: Camera, patterns: Float32, weights: Sequence[float], budget: Budget
 ) -> Levels:
-    """Show patterns (patterns, columns) and return what pixels saw; weights share the time of the SPAD among them.
+    """Show patterns (patterns, columns) and return what pixels saw. weights: shares of the SPAD's time, by pattern.
 
-    A conventional camera exposes all patterns equally, and in several exposures each if one would saturate. A camera's
-    variance is only that of rounding until `with_noise` has it fitted.
+    A conventional camera exposes all patterns equally. If an exposure would saturate, it takes several shorter ones of
+    each pattern. A camera's variance is only that of rounding until `with_noise` has fitted it.
     """
     if camera == "spad":
         frames = spad_frames(apparatus, budget, weights)
@@ -118,11 +119,11 @@ def _exposure(apparatus: Apparatus, patterns: Float32, budget: Budget) -> tuple[
 
 
 def with_noise(levels: Levels, camera: Camera, expected: Float64, free: int) -> tuple[Levels, Float64]:
-    """Levels with a camera's noise fitted, and how many times larger the variance is than noise explains.
+    """Levels with the fitted noise of a camera, and how many times larger the variance is than noise explains.
 
-    expected: the light (patterns, rows, width) that the decoded pattern lets expect. free: parameters that were fitted
-    in each pixel for it; fewer than there are patterns. The second result is float64 (rows, width), at least 1: haze
-    and blur, too, move light away from what is expected, and then the levels say less than their noise promises.
+    expected: light (patterns, rows, width) that the decoded pattern would give. free: number of parameters that were
+    fitted for it in each pixel, less than the number of patterns. The second result is float64 (rows, width), at least
+    1. It is more where haze or blur change the light: there the levels are less exact than their noise says.
     """
     spare = len(levels.light) - free
     squares = np.square(levels.light - expected)
@@ -158,8 +159,10 @@ def normal_cdf(z: Float64) -> Float64:
 
 
 def columns_at_infinity(geometry: ColumnGeometry) -> Float64:
-    """Column (rows, width) in whose light plane a pixel's ray runs to infinity, outside the field for most. The inverse
-    depth grows with the distance from it, so 2 % of that distance are 2 % of the depth. NaN for pixels without columns.
+    """Column (rows, width) whose light plane meets a pixel's ray at infinity; mostly it is outside the field.
+
+    The inverse depth is proportional to the distance from this column. So an error of 2 % of this distance is an error
+    of 2 % of the depth. NaN for pixels without columns.
     """
     low, high = geometry.first - 0.25, np.maximum(geometry.last, geometry.first) + 0.25
     near, far = 1.0 / geometry.depth_m(low).astype(np.float64), 1.0 / geometry.depth_m(high).astype(np.float64)
@@ -168,9 +171,9 @@ def columns_at_infinity(geometry: ColumnGeometry) -> Float64:
 
 
 def answer_of(geometry: ColumnGeometry, column: Float64, sd: Float64, right: Float64) -> Answer:
-    """Answer with the depths of columns (rows, width), fractional, NaN where there is none.
+    """Answer with the depths of fractional columns (rows, width), NaN where there is none.
 
-    sd: standard deviation of the column where it is not grossly wrong. right: probability that it is not.
+    sd: standard deviation of the column, provided that it is not grossly wrong. right: probability of that.
     """
     depth = geometry.depth_m(np.where(geometry.defects, np.nan, column))
     allowed = np.nan_to_num(GOOD * np.abs(column - columns_at_infinity(geometry)))
@@ -180,22 +183,26 @@ def answer_of(geometry: ColumnGeometry, column: Float64, sd: Float64, right: Flo
 
 
 def peak_offset(before: Float64, at: Float64, after: Float64) -> Float64:
-    """Position of a peak between three equally spaced scores, -1/2 to 1/2: two straight flanks of equal slope.
+    """Position of a peak with two straight flanks of equal slope, from three equally spaced scores: -1/2 to 1/2.
 
-    at: at least as large as both others. 0 for three equal scores.
+    at: the middle score, at least as large as the others. The result is 0 for three equal scores.
     """
     fall = at - np.minimum(before, after)
     return np.where(fall > 0, 0.5 * (after - before) / np.where(fall > 0, fall, 1.0), 0.0)
 
 
 def window_columns(geometry: ColumnGeometry) -> int:
-    """Columns after which a code may repeat: more than can light any one pixel's surface within the depth range."""
+    """Number of columns after which a code may repeat: more than those that can light one pixel's surface within the
+    depth range."""
     return int(np.max(geometry.last - geometry.first + 1, initial=1)) + 2
 
 
 def unwrapped(geometry: ColumnGeometry, number: Float64, period: float) -> Float64:
-    """Column (rows, width) of a code number that repeats: the one from one column before the first feasible on. NaN if
-    that lies beyond the last by more than a column."""
+    """Column (rows, width) of a code number that repeats after `period` columns.
+
+    It is the first such column, counted from one column before the first feasible one. NaN if it is more than a column
+    after the last feasible one.
+    """
     low = geometry.first - 1.0
     column = low + np.mod(number - low, period)
     return np.where(column <= geometry.last + 1.0, column, np.nan)

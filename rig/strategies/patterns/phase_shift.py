@@ -5,16 +5,18 @@ sum L_k exp(i theta_k) and a its modulus times 2 / M. To first order
 
     var(phi) = (2 / (M a))^2 sum sin^2(phi - theta_k) var(L_k)
 
-which for N photons at full contrast is 2 / N, whatever the number of shifts; a period of P columns then has a standard
-deviation of P / (2 pi) sqrt(2 / N). Which period it is, a Gray code of half periods says (G. Sansoni, M. Carocci,
-R. Rodella, Applied Optics 38, 1999): its cells begin a quarter of a period off the wraps, so a cell too far on its
-border does no harm. Without it one period
-covers all columns that the depth range lets a pixel see. Micro phase shifting (M. Gupta, S. K. Nayar, CVPR 2012)
-shows periods that differ little, all short, one of them with three shifts and the others once: haze, which is wide, has
-no contrast at short periods, and is the same for all of them.
+For N photons at full contrast this is 2 / N, whatever the number of shifts. The standard deviation of the column is
+then P / (2 pi) sqrt(2 / N) for a period of P columns. There are three ways to know the period:
 
-OpenCV's `SinusoidalPattern` knows three shifts of 8-bit images only, and unwraps along paths over the picture, which
-depth edges break; it is the tests' oracle for three shifts.
+- a Gray code of half periods (G. Sansoni, M. Carocci, R. Rodella, Applied Optics 38, 1999). Its cells begin a quarter
+  of a period away from where the phase jumps, so the next cell does no harm at a border;
+- a single period that covers all columns which a pixel can see within the depth range;
+- micro phase shifting (M. Gupta, S. K. Nayar, CVPR 2012). Several short periods of nearly the same length are shown,
+  one with three shifts and the others once. Haze is wide, so it has no contrast at short periods, and is the same for
+  all of them.
+
+OpenCV's `SinusoidalPattern` has only three shifts of 8-bit images, and counts periods along paths over the picture,
+which end at depth edges. Tests compare with it for three shifts.
 """
 
 from dataclasses import dataclass
@@ -42,26 +44,29 @@ from rig.strategies.patterns.posterior import Window
 from rig.strategies.strategy import Answer, ColumnGeometry, Light
 
 PERIOD: Final = 8.0
-"""Columns of a period: short, for precision, but a column that spreads over its neighbours leaves it most of its
-contrast; a Gaussian of one column's standard deviation leaves 73 %."""
+"""Columns of a period. A short period is precise. This one still keeps most of its contrast if a column spreads over
+its neighbours: 73 % with a Gaussian of a standard deviation of one column."""
 FEWEST_SHIFTS, MOST_SHIFTS = 3, 8
 LEAST_AMPLITUDE: Final = 1e-9
-"""Photons per frame, or grey levels: below it there is no sine, and any phase is as good."""
+"""Least amplitude, in photons per frame or grey levels. Below it there is no sine, and the phase means nothing."""
 MICRO_PERIODS: Final = 7
-"""Different periods of Micro phase shifting; with two more shifts of the first that makes nine pictures."""
+"""Number of different periods of micro phase shifting. With two more shifts of the first that makes nine pictures."""
 MICRO_BAND: Final = (8.0, 12.0)
-"""Columns; the periods lie in this narrow band, so that haze and blur treat them alike."""
+"""Shortest and longest period in columns: a narrow band, so that haze and blur change all periods alike."""
 MICRO_TRIALS: Final = 100
-"""Random sets of periods among which the best one is taken."""
+"""Number of random sets of periods, of which the best one is taken."""
 _GOLDEN: Final = 0.6180339887
 """Fractional part of the golden ratio; no two of its multiples are alike."""
 MICRO_STEP: Final = 0.25
-"""Columns between the places at which the correlation is looked at around its peak."""
+"""Columns between the places around its peak at which the correlation is computed."""
 
 
 def whole_period(least: float, columns: int) -> float:
-    """Period of at least so many columns, or the whole field, of which the field holds a whole number. Otherwise some
-    shifts would light more of it than others, and a source that shares its power would light them less."""
+    """Shortest period of at least `least` columns of which a whole number fits the field; at most the whole field.
+
+    With another period some shifts would light more columns than others. A source whose columns share its power would
+    then show these shifts less brightly.
+    """
     return columns / max(int(columns / least), 1)
 
 
@@ -99,7 +104,7 @@ def fitted_sines(levels: Levels) -> Float64:
 class PhaseShift:
     """Phase shift with a SPAD or a conventional camera. Raises UsageError for fewer than 3 or more than 8 shifts.
 
-    unwrap: 'gray' shows a Gray code of half periods too, 'none' has one period.
+    unwrap: how the period is known. 'gray': by a Gray code of half periods; 'none': there is only one.
     """
 
     name: str
@@ -174,9 +179,9 @@ def _mean_of(levels: Levels, times: int) -> Levels:
 
 
 def micro_periods(columns: int, window: int) -> Float64:
-    """Periods (MICRO_PERIODS,) of Micro phase shifting in columns, of which the field holds whole numbers.
+    """Periods (MICRO_PERIODS,) of micro phase shifting in columns. A whole number of each fits the field.
 
-    Those of `MICRO_TRIALS` random sets whose columns, up to `window` apart, are the hardest to mix up.
+    Of `MICRO_TRIALS` random sets it is the one whose codes of columns up to `window` apart are the least alike.
     """
     return np.array(_micro_periods(columns, window))
 
@@ -196,15 +201,18 @@ def _micro_periods(columns: int, window: int) -> tuple[float, ...]:
 
 
 def micro_sines(periods: Float64, column: ArrayLike) -> Float32:
-    """Brightness (MICRO_PERIODS + 2, n) of columns (n,), fractional ones too: the first period with three shifts, the
-    others with one, a different one for each: sines with a common peak would look the same on both sides of it."""
+    """Brightness (MICRO_PERIODS + 2, n) of columns (n,), which may be fractional.
+
+    The first period has three shifts, the others one each. These shifts are all different: sines with a common peak
+    would look the same on both sides of it.
+    """
     shift = np.concatenate([[0, 1 / 3, 2 / 3], _GOLDEN * np.arange(1, len(periods))])
     phase = np.asarray(column) / np.concatenate([periods[[0, 0]], periods])[:, None] - shift[:, None]
     return np.asarray(0.5 + 0.5 * np.cos(2 * np.pi * phase), np.float32)
 
 
 def unit_codes(patterns: Float32) -> Float32:
-    """Codes (patterns, columns) of columns: their brightness without its mean, at unit length; 0 if it is constant."""
+    """Codes (patterns, columns) of columns: the brightness minus its mean, scaled to length 1; 0 if it is constant."""
     centred = patterns - patterns.mean(axis=0)
     length = np.sqrt((centred**2).sum(axis=0))
     return np.asarray(centred / np.where(length > 0, length, 1.0), np.float32)
@@ -214,8 +222,8 @@ def unit_codes(patterns: Float32) -> Float32:
 class MicroPhaseShift:
     """Micro phase shifting with a SPAD or a conventional camera.
 
-    Offset and amplitude of each pixel are free, as in the paper, but solved together with the column by least squares:
-    the column whose code correlates best with the levels.
+    As in the paper, each pixel has an unknown offset and amplitude. Here they are fitted together with the column, by
+    least squares: the answer is the column whose code correlates best with the levels.
     """
 
     name: str

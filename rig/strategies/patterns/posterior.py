@@ -1,7 +1,8 @@
-"""The likeliest column of a pixel among those that its depth range allows, and the probability that it is right.
+"""The likeliest column of a pixel among those that the depth range allows, and the probability that it is right.
 
-Every feasible column is as likely as any other before the measurement. Light that no column explains, such as haze or a
-blurred border, makes the fit worse than noise does, by a factor `excess` in variance; likelihoods are tempered by it.
+These columns are called feasible. Before the measurement they are all equally likely. Haze or a blurred border is light
+that no column explains. Its variance about the fit is `excess` times that of noise alone, so logarithms of likelihoods
+are divided by `excess`.
 """
 
 from typing import Final, TypeVar
@@ -16,11 +17,14 @@ from rig.strategies.strategy import ColumnGeometry
 Number = TypeVar("Number", np.int64, np.float64)
 
 MARGIN: Final = 1
-"""Columns beyond the feasible ones at either end that are searched too: the surface may lie between two."""
+"""Number of columns beyond the feasible ones, at either end, that are searched too: a surface may lie between two."""
 
 
 class Window:
-    """Feasible columns of the pixels of one row, each with its margin: as many for all pixels as the widest needs."""
+    """Candidates of the pixels of one row: their feasible columns and the margin at both ends.
+
+    All pixels have the same number of candidates; `feasible` says which of them count.
+    """
 
     def __init__(self, geometry: ColumnGeometry, row: int, infinite: Float64) -> None:
         """row: index of a measured row. infinite: `columns_at_infinity` of all rows."""
@@ -34,30 +38,36 @@ class Window:
         self._infinite = infinite[row]
 
     def of(self, by_number: NDArray[Number]) -> NDArray[Number]:
-        """Values (width, candidates) of the candidates, from those of code numbers (width, numbers), which repeat."""
+        """Values (width, candidates) of the candidates, from the values (width, numbers) of the code's numbers.
+
+        Column c has number c modulo the number of values."""
         return np.take_along_axis(by_number, np.mod(self.columns, by_number.shape[1]), axis=1)
 
     def best(self, score: NDArray[Number]) -> NDArray[np.int64]:
-        """Place (width,) of the candidate with the highest score (width, candidates)."""
+        """Index (width,) of the feasible candidate with the highest score. score: (width, candidates)."""
         place: NDArray[np.int64] = np.where(self.feasible, score, -np.inf).argmax(axis=1)
         return place
 
     def column(self, place: NDArray[np.int64]) -> Float64:
-        """Column (width,) at a place among the candidates, NaN for pixels without any feasible one."""
+        """Column (width,) of the candidate with this index, NaN for pixels without a feasible candidate."""
         at = self.columns[np.arange(len(place)), place].astype(np.float64)
         return np.where(self.feasible.any(axis=1), at, np.nan)
 
     def around(self, score: Float64, place: NDArray[np.int64]) -> tuple[Float64, Float64, Float64]:
-        """Score of the candidates before, at and after a place, (width,) each; at the ends the same as at the place."""
+        """Scores of the candidates before, at and after an index, (width,) each.
+
+        The first and the last are at most that at the index, and equal to it where there is no such candidate.
+        """
         pixel, most = np.arange(len(place)), score.shape[1] - 1
         at = score[pixel, place]
         before, after = score[pixel, np.maximum(place - 1, 0)], score[pixel, np.minimum(place + 1, most)]
         return np.minimum(before, at), at, np.minimum(after, at)
 
     def right(self, log_likelihood: Float64, place: NDArray[np.int64]) -> tuple[Float64, Float64]:
-        """Probability (width,) that the column is the one at a place, or one within a column or the tolerance of it.
+        """Probability (width,) that the column is near the candidate with this index, and the spread of near columns.
 
-        Also the root mean square distance (width,) of these columns from the place, weighted by their probability.
+        Columns are near if they are within one column, or if their depth is within the tolerance of a good answer. The
+        spread (width,) is their root mean square distance in columns, weighted by their probability.
         """
         seen = np.where(self.feasible, log_likelihood, -np.inf)
         peak = seen.max(axis=1, keepdims=True)
