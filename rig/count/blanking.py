@@ -203,7 +203,8 @@ class MarkerLine:
         self.sd.append(max(sd, LEAST_SD_FRAMES))
 
     def fit(self, index: int) -> tuple[float, float, float]:
-        """Place of the scan marker of sweep `index` and its standard deviation; frames per sweep. Needs two markers."""
+        """Place of the scan marker of sweep `index` in frames, its standard deviation, and the number of frames per
+        sweep, from a straight line through the markers found. Needs two markers or more."""
         weight = np.array(self.sd) ** -2.0
         x = np.array(self.index, np.float64) - index
         middle = float(weight @ x / weight.sum())

@@ -41,11 +41,11 @@ class Switch(Protocol):
         ...
 
     def on(self) -> None:
-        """Record."""
+        """Begin to record."""
         ...
 
     def off(self) -> None:
-        """End the part."""
+        """End the part that is being recorded."""
         ...
 
 

@@ -1,22 +1,23 @@
-"""The surface in a histogram of first photons: its time, the error of this time, and how far it is to be believed.
+"""The surface in a histogram of first photons: its time, the error of this time, and the confidence.
 
-Of N pulses only E = N - (photons before) find the pixel still waiting at a bin. With n photons in a bin its rate is
--log(1 - n / E) a pulse (Coates, J. Phys. E 1, 1968). Counts are corrected to -E log(1 - n / E), which vary about as
-counts do, and every model is multiplied by the share E / N.
+A pixel detects only one photon per pulse. So of N pulses only E = N - (photons in earlier bins) find the pixel still
+waiting at a bin. With n photons in the bin the rate is -log(1 - n / E) per pulse (Coates, J. Phys. E 1, 1968). Counts
+are corrected to -E log(1 - n / E), whose variance is about that of counts, and every model is multiplied by E / N.
 
-The background of a pixel is a t^b exp(-c t) + u: light of fog, and ambient light with dark counts. It is fitted with
-what a surface returned left out. A matched filter's value m (a pulse of A photons gives A on average, a constant
-background a variance equal to its mean) is held against the mean mu that the background gives, as the Poisson
-likelihood ratio
+The background of a pixel is a t^b exp(-c t) + u: light of fog, and ambient light with dark counts. It is fitted without
+the bins around the surface's peak. The matched filter of the counts has a value m at each time. It is scaled so that a
+pulse of A photons gives A on average, and a constant background has a variance equal to its mean. It is compared with
+the mean mu that the background gives, by the logarithm of the Poisson likelihood ratio
 
     L = m log(m / mu) - m + mu,      m > mu.
 
-A surface is believed with the probability of L, averaged over an unknown amplitude (which costs log(1 + m) / 2), at the
-peak and beside it, over the sum for all times, with even odds beforehand that there is no surface. For this, mu is
-raised to what was counted directly before and behind: a hump that is wider than the pulse is no surface.
+Averaging over the unknown amplitude subtracts log(1 + m) / 2. The confidence is the sum of these likelihood ratios at
+the peak and beside it, divided by their sum over all times; beforehand it is as likely that there is no surface as that
+there is one. For this, mu is raised to the light counted directly before and after the peak: a hump that is wider than
+the pulse is no surface.
 
-Within its peak a surface's time is the maximum of the likelihood of a Gaussian pulse of A photons on its background b
-per bin, found by Fisher's scoring. Its error is at least the Cramer-Rao bound, for a pulse g of standard deviation s
+The time of the surface maximises the likelihood of a Gaussian pulse of A photons on its background of b per bin; it is
+found by Fisher's scoring. Its error is at least the Cramer-Rao bound, for a pulse g of standard deviation s
 
     sd^2 = 1 / I,    I = sum over bins of (A g')^2 / (A g + b);      I = A / s^2 without background.
 """
@@ -32,16 +33,18 @@ from rig.simd import Float64
 from rig.strategies.apparatus import PulseTimes
 
 REACH: Final = 4.0
-"""Standard deviations of the pulse to either side that belong to a peak."""
+"""Half the width of a peak, in standard deviations of the pulse."""
 FLANK_SIGMAS: Final = (4.0, 12.0)
 """Distances from a peak between which the light on either side is counted, in standard deviations of the pulse."""
 FOG_NODES: Final = 48
-"""Intervals of time, evenly spaced in its logarithm, by which a background is fitted, and linear in between."""
+"""Number of intervals of time for the fit of a background. They are equally long in the logarithm of time; within an
+interval the background is linear."""
 FOG_STEPS: Final = 15
 FOG_TURNS: Final = 2
-"""Number of times that a background is fitted, and a peak sought that is left out of the next fit."""
+"""Number of times that a background is fitted and a peak sought. The peak is left out of the next fit."""
 FOG_PRIOR: Final = np.array([1 / 5.0**2, 1 / 3.0**2, 1 / 10.0**2])
-"""Precisions of log a, b and of c times the length of the gate, about a lidar's in clear air."""
+"""Precisions (1 / variance) of the prior of log a, of b, and of c times the length of the gate. The prior has its
+centre at b = -1 and c = 0."""
 PLACING_STEPS: Final = 12
 
 Counts = NDArray[np.uint32]
@@ -49,9 +52,11 @@ Whole = NDArray[np.int64]
 
 
 class TimedSurfaces(NamedTuple):
-    """The surface of each pixel, float64 (pixels,): time_s of its return; sd_s, standard deviation of that time by the
-    Cramer-Rao bound with the pixel's own counts; photons of it; confidence that it is a surface, 0 to 1. time_s is NaN
-    and the others 0 where no photon came while a surface could have sent it.
+    """The surface that each pixel sees, float64 (pixels,).
+
+    time_s: time at which its light arrives. sd_s: standard deviation of this time, the Cramer-Rao bound for the pixel's
+    own counts. photons: number of its photons. confidence: probability that it is a surface. If no photon arrived while
+    light of a surface could arrive, time_s is NaN and the others are 0.
     """
 
     time_s: Float64
@@ -103,11 +108,12 @@ def surfaces(
 
 
 class Nodes(NamedTuple):
-    """Intervals of time.
+    """Intervals of time, for the fit of a background.
 
-    of_bin: int64 (bins,), the interval of each bin. share: (bins,), where in it the bin lies, 0 to 1. edges: (number +
-    1, 3), the features 1, log t and -t of the ends; they are 0 at the first end, and -t is -1 at the last. middle:
-    (number, 3), their means over the bins of an interval. used: (number,), 1 for intervals that have a bin, else 0.
+    of_bin: int64 (bins,), the interval of each bin. share: (bins,), place of the bin in its interval, 0 to 1. edges:
+    (number + 1, 3), the terms 1, log t and -t at the ends of intervals; log t and -t are 0 at the first end, and -t is
+    -1 at the last. middle: (number, 3), means of the terms over the bins of an interval. used: (number,), 1 for
+    intervals with a bin, else 0.
     """
 
     of_bin: Whole
@@ -123,8 +129,8 @@ class Nodes(NamedTuple):
 
     @classmethod
     def over(cls, time_s: Float64) -> "Nodes":
-        """Intervals over bins at these times (bins,), ascending; what comes before a thousandth of the last counts as
-        coming then."""
+        """Intervals over bins at these times (bins,), ascending. Times below a thousandth of the last one are raised to
+        that."""
         t = np.maximum(time_s, 1e-3 * time_s[-1])
         number = min(FOG_NODES, len(t))
         ends = np.geomspace(t[0], max(t[-1], t[0] * (1 + 1e-9)), number + 1)
@@ -143,12 +149,11 @@ class Nodes(NamedTuple):
 
 
 def fog_background(counts: Float64, share: Float64, nodes: Nodes) -> Float64:
-    """Light of fog and surroundings a t^b exp(-c t) + u in counts per bin, at the ends of the intervals, float64
-    (pixels, number + 1).
+    """The background a t^b exp(-c t) + u in counts per bin, at the ends of the intervals, float64 (pixels, number + 1).
 
-    counts, share: (pixels, number), sums over the bins of each interval of photons, and of the share of pulses that
-    could put one there. Newton's method for the Poisson likelihood of a, b and c alternates with expectation and
-    maximisation for u. b and c have a broad prior, so that few photons do not make a wild curve.
+    counts: photons in each interval, (pixels, number). share: sum over the bins of each interval of the share of pulses
+    that find the pixel waiting. Newton's method for the Poisson likelihood of a, b and c alternates with expectation
+    and maximisation for u. a, b and c have a broad prior, so that few photons do not give an extreme curve.
     """
     total = np.maximum(share.sum(axis=1), 1.0)
     mean = (counts.sum(axis=1) + 0.5) / total
@@ -168,7 +173,7 @@ def fog_background(counts: Float64, share: Float64, nodes: Nodes) -> Float64:
 
 
 def matched_filter(sigma: float) -> Float64:
-    """Gaussian of `sigma` bins, scaled such that a constant background has a variance equal to its mean."""
+    """A Gaussian of `sigma` bins. Its scale makes the variance of a filtered constant background equal to its mean."""
     half = math.ceil(REACH * sigma)
     pulse = np.exp(-0.5 * np.square(np.arange(-half, half + 1) / sigma))
     return np.asarray(pulse * (np.sum(pulse) / np.sum(pulse**2)), np.float64)
@@ -176,8 +181,8 @@ def matched_filter(sigma: float) -> Float64:
 
 @numba.njit(cache=True, nogil=True)
 def without_pile_up(counts: Counts, pulses: int, corrected: Float64, share: Float64) -> None:
-    """Write into corrected (bins,) the counts (bins,) without pile-up, and into share (bins,) the share of pulses that
-    found the pixel waiting. With 0 pulses counts stay as they are, and shares are 1.
+    """Write the counts without pile-up into `corrected`, and the share of pulses that find the pixel waiting into
+    `share`; all are (bins,). With 0 pulses counts stay as they are, and shares are 1.
     """
     left = float(pulses)
     for i in range(len(counts)):
@@ -217,7 +222,7 @@ def _filter(corrected: Float64, matched: Float64, value: Float64) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def ratio(value: float, expected: float) -> float:
-    """Logarithm of the likelihood ratio of a count with and without a surface; 0 for fewer than expected."""
+    """Logarithm L of the likelihood ratio of a count with and without a surface; 0 if the count is below the mean."""
     if value <= expected:
         return 0.0
     return value * math.log(value / expected) - (value - expected)

@@ -1,16 +1,16 @@
-"""Point scans: one spot at a time, the SPAD array looks at the row on which it lies.
+"""Point scans: one spot of light at a time; the SPAD array looks at the row on which it lies.
 
-The spot is just bright enough for a surface to be seen in a frame, which a few spots of rising brightness show: more
-light would fill the row with fog, to a sensor that counts to one. Spots lie on a grid that is as fine as the time
-allows, on every row and column at best. A spot's time is at least one frame. The whole picture counts: if only some of
-its rows are measured, they get their share of the time. Rows without spots have the depths of the nearest row with
-spots.
+The spot is just bright enough for a surface to be seen in one frame. Test spots of rising brightness show how bright
+that is. With more light the fog would fill the row, since a pixel counts at most one photon per frame. Spots lie on a
+grid that is as fine as the time allows, at best on every row and column. Each spot has at least one frame. If only some
+rows of the picture are measured, they get their share of the time. Rows without spots have the depths of the nearest
+row with spots.
 
-`first-bright` goes along the row from the far end and takes the first bright spot: fog scatters light back on the near
-side of the surface, and nothing does behind it. Five pixels together are bright if their counts are above what ambient
-light and dark counts make of them, with one wrong place in a hundred rows; the brightest five from there on, as far as
-a spot is wide, are the answer. `likelihood` reads the same counts with the estimator of this name, which learns how
-much light fog and surface send back, and knows that a pixel cannot count more than one in a frame.
+`first-bright` goes along the row from the far end and takes the first bright place, since fog sends back light in front
+of the surface, but nothing does behind it. A place is five pixels. It is bright if it has more counts than ambient
+light and dark counts explain; the threshold allows one wrong place in a hundred rows. From there on, within the width
+of a spot, the brightest place is the answer. `likelihood` uses the estimator of this name on the same counts. It learns
+how much light fog and surfaces send back, and takes into account that a pixel counts at most one photon per frame.
 """
 
 import math
@@ -32,24 +32,25 @@ from rig.strategies.line_scan import MIN_CONFIDENCE, frames_within, windowed
 from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
 
 COARSEST: Final = 16
-"""Largest distance of spots, in rows and columns."""
+"""Largest distance of neighbouring spots, in rows and in columns."""
 FALSE_ROWS: Final = 0.01
 """Share of rows on which a place without the spot's light counts as bright."""
 WIDTH_PX: Final = 2
 """Pixels of a spot on each side of its middle."""
 BRIGHTNESS: Final = tuple(4.0**-step for step in range(6, -1, -1))
-"""Shares of the power that are tried, the least first."""
+"""Brightnesses of test spots, as shares of the power, the least first."""
 TRIED: Final = 20
-"""Spots with which each is tried."""
+"""Number of test spots of each brightness."""
 LIT: Final = 0.021
-"""Share of a window's pixels that fire if spots are seen: three of 150."""
+"""Share of a window's pixels that must fire because of a spot, for the spot to be seen: three of 150."""
 SHRINK: Final = 4.0
-"""A pixel's ambient rate is learned from its own frames and, as if it were so many, from all of the picture."""
+"""A pixel's ambient rate is learned from its own frames; the mean of the picture is added with the weight of so many
+frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Spots of a scan. rows: indices of measured rows; columns: of the projector; frames: of each spot."""
+    """Spots of a scan. rows: indices of measured rows. columns: of the projector. frames: number for each spot."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -57,9 +58,9 @@ class Grid:
 
 
 def grid_within(frames: int, shape: tuple[int, int]) -> Grid | None:
-    """The grid with most spots on (rows, columns) for so many frames; None if it would be coarser than COARSEST.
+    """The grid with the most spots for a number of frames; None if it would be coarser than COARSEST.
 
-    Distances of rows and of columns differ by one at most.
+    shape: number of rows and of columns. The distances of spots along rows and along columns differ by at most one.
     """
     best: Grid | None = None
     for down in range(1, COARSEST + 1):
@@ -110,10 +111,10 @@ class PointScan:
 
 
 def choose_brightness(apparatus: Apparatus, geometry: ColumnGeometry, rng: np.random.Generator) -> float:
-    """The least of BRIGHTNESS at which spots are seen: a few at random places, one frame each.
+    """The least of BRIGHTNESS at which a surface is seen, found with test spots at random places, one frame each.
 
-    Judged are the pixels within the search windows, by the share that the spot makes fire of those that ambient light,
-    measured first, does not.
+    First, ambient light is measured. Of the pixels within the search windows that it does not make fire, at least the
+    share LIT must fire because of the spot.
     """
     sweep = geometry.sweep()
     x = np.arange(geometry.shape[1])
@@ -144,9 +145,9 @@ def _count(apparatus: Apparatus, sweep: SweepGeometry, grid: Grid, brightness: f
 
 
 def first_bright(volume: CountVolume, geometry: SweepGeometry) -> StripeTable:
-    """Stripe table: on every row the first bright spot from the far end.
+    """Stripe table with the first bright spot of every row, seen from the far end.
 
-    Confidence: probability that ambient light has made no place of the row so bright, by Chernoff's bound.
+    Confidence is the probability that ambient light has made no place of the row so bright, by Chernoff's bound.
     """
     ambient = ambient_rate(volume, geometry)
     columns, rows, window = volume.counts.shape
@@ -216,9 +217,10 @@ def ambient_rate(volume: CountVolume, geometry: SweepGeometry) -> Float64:
 
 
 def tail(counts: Float64, frames: Float64, rate: Float64) -> Float64:
-    """Chernoff's bound of the probability of at least so many counts in so many frames at a rate of 0 to 1 per frame.
+    """Chernoff's bound of the probability of at least this number of counts. rate: probability of a count in a frame.
 
-    exp(-frames D(counts/frames || rate)) with D the relative entropy; 1 where the counts are not above the mean.
+    It is exp(-frames D(counts / frames || rate)) with the relative entropy D, and 1 where the counts are not above the
+    mean.
     """
     share = np.minimum(counts / frames, 1.0)
     rate = np.clip(rate, 1e-12, 1 - 1e-12)

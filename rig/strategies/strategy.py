@@ -1,9 +1,9 @@
-"""A way to measure depth: what every one of them is, and how it is found by name.
+"""The interface of a strategy, that is, of a way to measure depth, and the search for a strategy by its name.
 
 A strategy chooses what is lit and for how long, gets what the camera reads (`rig.strategies.apparatus`), and answers
-with a depth for each pixel. An entry point of the group `spadrig.strategies` loads such an object, most simply of a
-frozen dataclass, and has its name; so another package can add one. `ColumnGeometry` is all that a strategy knows of the
-rig: where a column of light lies in space.
+with a depth for each pixel. An entry point of the group `spadrig.strategies` has the strategy's name and loads the
+object, most simply one of a frozen dataclass. So another package can add a strategy. All that a strategy knows of the
+rig is its `ColumnGeometry`: where a column of light lies in space.
 """
 
 from dataclasses import dataclass, replace
@@ -25,9 +25,10 @@ from rig.strategies.apparatus import Apparatus, Budget
 GROUP: Final = "spadrig.strategies"
 """Group of the entry points."""
 Light = Literal["spot", "line", "pattern", "flash", "ambient"]
-"""The source lights at a time: a spot, a line or a few, a picture, everything with pulses, or nothing at all."""
+"""The part that the source lights at a time: a spot, one or more lines, a pattern, the whole picture with pulses, or
+nothing, with ambient light only."""
 BEYOND: Final = 0.1
-"""Share of the inverse depths at the ends of the depth range by which an answer may lie beyond it, as in depth maps."""
+"""An answer may lie beyond the depth range by this share of the inverse depth at its end, as in depth maps."""
 
 
 class TooShort(Exception):  # noqa: N818 - not an error: the comparison shows that there is no such measurement
@@ -48,7 +49,7 @@ class Answer:
 
 @runtime_checkable
 class Strategy(Protocol):
-    """A way to measure depth. The same object may measure with any apparatus, and keeps nothing between two of them."""
+    """A way to measure depth. One object may measure with many apparatuses, and keeps nothing from one to the next."""
 
     @property
     def name(self) -> str:
@@ -72,7 +73,7 @@ class Strategy(Protocol):
 
     @property
     def clear_px(self) -> float:
-        """Largest median error, in pixels of disparity, that it promises in clear air with plenty of light."""
+        """Largest median error, in pixels of disparity, in clear air with plenty of light. Tests check it."""
         ...
 
     def measure(self, apparatus: Apparatus, geometry: "ColumnGeometry", budget: Budget, rng_seed: int) -> Answer:
@@ -84,16 +85,18 @@ class Strategy(Protocol):
 
 
 class ColumnGeometry:
-    """Places of the light of each column, for the rows that are measured. Columns are fractional, centres at integers.
+    """Where the light of each column lies, for the rows that are measured. Columns are fractional, centres at integers.
 
-    Between two columns the inverse depth at which a pixel sees them is interpolated linearly, which is exact to 3e-5 of
-    the depth for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.
+    For each pixel, the inverse depth is interpolated linearly between two columns. That is exact to 3e-5 of the depth
+    for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.
     """
 
     def __init__(
         self, model: RigModel, commands: ArrayLike, depth_range_m: tuple[float, float], rows: NDArray[np.int64]
     ) -> None:
-        """Make it of a calibrated rig. commands: (columns,) of the mirror, at the columns' centres. rows: image rows.
+        """Make the geometry of a calibrated rig.
+
+        commands: of the mirror at the centres of columns, (columns,). rows: image rows that are measured, ascending.
 
         Raises UsageError for light that is bent (it bows, or rows are exposed one after the other), for fewer than two
         columns, for rows that the camera does not have, and as `sweep_geometry` does.
@@ -144,15 +147,15 @@ class ColumnGeometry:
         return len(self.commands)
 
     def sweep(self, commands: Float64 | None = None) -> SweepGeometry:
-        """Rays, planes and windows of the measured rows, for the estimators. commands: others than its own, (n,)."""
+        """Rays, planes and windows of the measured rows, for the estimators. commands: (n,), instead of its own."""
         whole = self._whole if commands is None else sweep_geometry(self.model, commands, self.depth_range_m)
         return _rows_of(whole, self.rows)
 
     def depth_m(self, column: ArrayLike) -> Float32:
         """Depth z (..., rows, width) in metres of pixels that are lit by fractional columns (..., rows, width).
 
-        NaN where the column is NaN or lies more than half a column outside, for pixels without a ray, and where the
-        depth lies beyond the depth range by more than `BEYOND`.
+        NaN where the column is NaN or lies more than half a column outside the field, for pixels without a ray, and
+        where the depth lies beyond the depth range by more than `BEYOND`.
         """
         at = np.asarray(column, np.float64)
         inverse = self._inverse(at)
@@ -163,7 +166,8 @@ class ColumnGeometry:
     def column_of(self, depth_m: ArrayLike) -> Float64:
         """Fractional column (rows, width) that lights each pixel's surface at a depth (rows, width) in metres.
 
-        NaN where the depth is NaN or not positive, for pixels without a ray, and more than half a column outside.
+        NaN where the depth is NaN or not positive, for pixels without a ray, and where the column would lie more than
+        half a column outside the field.
         """
         depth = np.asarray(depth_m, np.float64)
         some = np.isfinite(depth) & (depth > 0)
@@ -209,7 +213,11 @@ def strategy_names() -> tuple[str, ...]:
 
 
 def find_strategy(name: str) -> Strategy:
-    """The strategy of this name. Raises UsageError, one line, if there is none, it is offered twice or is broken."""
+    """The strategy of this name.
+
+    Raises UsageError, with a message of one line, if there is none, if two packages offer it, if it cannot be loaded,
+    or if it calls itself by another name.
+    """
     try:
         found = load_entry("strategies", name, entry_points(group=GROUP), Strategy)  # type: ignore[type-abstract]
     except UnknownKind as error:

@@ -85,8 +85,10 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommandGrid:
-    """A grid of ascending positions (n,) float64. The cell of a position has all commands that are nearest to it. edges
-    (n - 1,): the borders between cells. `low` and `high` bound the first and the last cell.
+    """A grid of positions (mirror commands), ascending.
+
+    Each position has a cell: all commands that are nearer to it than to the others. positions: float64 (n,). edges:
+    borders between cells, (n - 1,). low, high: outer borders of the first and the last cell.
     """
 
     positions: Array

@@ -1,4 +1,4 @@
-"""The simulated apparatus: a camera in front of the world's scene, and a light source that shows what it is told to.
+"""The simulated apparatus: a camera in front of the world's scene, and a light source that shows given patterns.
 
 It has the members of `rig.strategies.apparatus.Apparatus`. Calls follow each other on its own clock, which begins at 0,
 and every exposure begins when the one before it ends. Counts and noise are drawn from one generator of a given seed.
@@ -8,8 +8,9 @@ A source of power P shows a pattern with relative brightness b_c in column c. Th
     rule "energy":       P b_c / (sum over columns of b)          the whole power, whatever is lit
     rule "irradiance":   P b_c / (columns / 2)                    as bright as P spread over half of the columns
 
-If the rows' patterns differ, the sum is the mean over the rows. A column is a whole line over the fan's angle. A spot
-is the part of a line in one row: with the same power it is brighter by the number of rows over which the fan spreads.
+If the patterns of rows differ, the sum is averaged over the rows. A column is a whole line over the fan's angle. A spot
+is the part of a line in one row, but it has the power of the whole line. So it is brighter than the line by a factor,
+the number of rows over which the fan spreads.
 """
 
 from collections.abc import Iterator
@@ -35,9 +36,9 @@ MOST_FRAMES = 2**32 - 1
 MOST_POWER_W = 1e6
 SPOTS_AT_ONCE = 4096
 DARK = "dark counts"
-"""Name of the effect that only the SPAD has, of those without the source."""
+"""Name of the effect without the source that only the SPAD has, not the conventional camera."""
 MULTIPLE = "halo"
-"""Name of the effect that is light scattered more than once."""
+"""Name of the effect of light that is scattered more than once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +135,7 @@ class SimulatedApparatus:
         """Show patterns one after the other, each for one exposure of the conventional camera: uint16 (patterns, rows,
         width), 0 to `camera_full_scale`.
 
-        patterns: as in `spad_counts`. Raises ValueError for an exposure shorter than `camera_frame_s`.
+        patterns: as in `spad_counts`. Raises ValueError if the exposure is shorter than `camera_frame_s`.
         """
         shown = self._checked(patterns)
         self._check_exposure(exposure_s)
@@ -158,8 +159,8 @@ class SimulatedApparatus:
         counts of each spot's own row.
 
         rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power. Light that a spot
-        scatters into other rows is not told. Raises ValueError for spots that do not exist, and for another brightness
-        than above 0 to 1.
+        scatters into other rows is not in the result. Raises ValueError for spots outside the picture, and for a
+        brightness that is not above 0 or is above 1.
         """
         if not 0 < brightness <= 1:
             raise ValueError(f"brightness of spots is {brightness:g}; it is above 0 and at most 1")
@@ -187,10 +188,10 @@ class SimulatedApparatus:
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
-        pixel detects after each pulse: see `sim_backend.projector.pulse`.
+        pixel detects after each pulse (see `sim_backend.projector.pulse`).
 
-        Raises ValueError for less than one pulse, for bins that do not fit into the gate, and for more counts than
-        memory should hold.
+        Raises ValueError for less than one pulse, for bins that are longer than the gate, and if the counts would need
+        too much memory.
         """
         (number,) = _frames(np.array([pulses]), 1).tolist()
         power_w = self._request.power_w * (2 if self._request.rule == "irradiance" else 1)
@@ -201,10 +202,10 @@ class SimulatedApparatus:
         return PulseTimes(counts, opened.start_s, bin_s, number)
 
     def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
-        """Images of two conventional cameras in ambient light only, without the narrow filter: uint16 (2, rows, width).
+        """Take one image with each of two conventional cameras, in ambient light only: uint16 (2, rows, width).
 
-        The second one stands where the light leaves the mirror: see `sim_backend.projector.stereo`. Raises ValueError
-        for an exposure shorter than `camera_frame_s`.
+        Both are without the narrow filter. The second one stands where the light leaves the mirror (see
+        `sim_backend.projector.stereo`). Raises ValueError for an exposure shorter than `camera_frame_s`.
         """
         self._check_exposure(exposure_s)
         camera, setting = self._hardware.camera, self._setting
@@ -265,7 +266,7 @@ class SimulatedApparatus:
 
 
 def rows_of_fan(setting: Setting) -> Array:
-    """Number of rows over which the fan of the line would spread, if all were as high as this one, (rows,) float64."""
+    """Number of rows over which the line's fan would spread if all were as high as a row, float64 (rows,)."""
     view = setting.view
     tangent = view.v[:, view.width // 2]
     return np.asarray(setting.line.fan * (1 + tangent**2) / np.abs(np.gradient(tangent)))

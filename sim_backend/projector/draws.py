@@ -27,9 +27,10 @@ from sim_backend.projector.hardware import ConventionalCamera
 Array = NDArray[np.float64]
 
 BLACK_SIGMAS = 4.0
-"""Black level of the conventional camera, in standard deviations of its read noise, which is then not cut off at 0."""
+"""Black level of the conventional camera, in standard deviations of its read noise, so that noise is not cut off at 0.
+"""
 INVERSION = 30.0
-"""Mean number of counts, or of frames without one, up to which they are drawn by inversion."""
+"""Counts are drawn by inversion if their mean number, or that of frames without a count, is not above this."""
 LEAST_CHANCE = 1e-25
 """Inversion ends at chances below it: only rounding can lead there. The first one is at least exp(-60 ln 2) = 1e-18."""
 
@@ -49,14 +50,14 @@ def inverted(uniform: float, frames: int, flux: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def next_wait(rng: np.random.Generator) -> float:
-    """An exponential variate: the mean number of counts that passes until the next pixel that fires."""
+    """An exponential variate: the sum of mean counts, pixel after pixel, at which the next pixel fires."""
     return -math.log(1.0 - rng.random())
 
 
 @numba.njit(cache=True, nogil=True)
 def count(rng: np.random.Generator, wait: float, frames: int, flux: float) -> tuple[int, float]:
-    """Number of frames out of `frames` in which a pixel fires that detects `flux` photons in a frame; and the wait that
-    is left for the next pixel. wait: what the pixel before has left, from `next_wait`."""
+    """Number of frames, out of `frames`, in which a pixel with a mean of `flux` photons per frame fires; and the wait
+    that is left for the next pixel. wait: what the pixel before has left; at first from `next_wait`."""
     mean = frames * flux
     if not flux > 0.0 or frames <= 0:
         return 0, wait
@@ -81,8 +82,8 @@ def add_counts(
     rng: np.random.Generator, frames: NDArray[np.int64], flux: Array, patterns: NDArray[np.int64],
     counts: NDArray[np.uint32],
 ) -> None:  # fmt: skip
-    """Add to counts[patterns] (patterns, rows, width) how many frames fire, out of frames (n,) with flux (rows, n,
-    width) photons a frame. patterns: (n,)."""
+    """Draw counts and add them to counts[patterns]. counts: (patterns, rows, width). patterns: (n,). frames: number of
+    frames for each of these patterns, (n,). flux: mean photons per frame, (rows, n, width)."""
     for y in range(flux.shape[0]):
         wait = next_wait(rng)
         for i in range(flux.shape[1]):
@@ -92,11 +93,11 @@ def add_counts(
 
 
 def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCamera) -> NDArray[np.uint16]:
-    """Readings of a conventional camera whose pixels collect so many electrons on average.
+    """Readings of a conventional camera whose pixels collect `electrons` on average.
 
     Electrons are Poisson distributed; a full pixel collects no more. The read-out adds Gaussian noise. The converter
-    rounds to whole steps, of which its range has 2^bits - 1 for the full well above a black level of `BLACK_SIGMAS` of
-    the noise.
+    rounds to whole steps. Its range has 2^bits - 1 steps, from 0 to the full well plus the black level, which is
+    `BLACK_SIGMAS` standard deviations of the noise.
     """
     # A pixel that is full beyond doubt needs no exact number.
     collected = rng.poisson(np.clip(np.nan_to_num(electrons), 0.0, 4.0 * camera.full_well + 1e3)).astype(np.float64)
@@ -110,9 +111,10 @@ def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCam
 class SensorBits:
     """The sensor's changes to the bits, pixel by pixel.
 
-    Dead and hot pixels and bit errors are exact. Of crosstalk and afterpulses the mean is right: each pixel has the
-    probability that it would have among such neighbours and after such a frame, but is drawn independently of them; the
-    rows above and below, which may not be measured, are taken to be as bright as the pixel itself.
+    Dead and hot pixels and bit errors are exact. Crosstalk and afterpulses have the right mean: each pixel has the
+    probability that follows from the brightness of its neighbours and of the frame before, but it is drawn
+    independently of them. The rows above and below may not be measured, so they are assumed to be as bright as the
+    pixel itself.
     """
 
     def __init__(self, flux: FluxModel, rows: NDArray[np.int64], frame_s: float) -> None:
@@ -133,7 +135,7 @@ class SensorBits:
         """Whether the bits stay as they are."""
 
     def flux(self, flux: Array, rows: slice | NDArray[np.int64]) -> Array:
-        """The flux (rows, patterns, width) of a perfect sensor whose bits would be as often 1."""
+        """The flux (rows, patterns, width) with which the bits of a perfect sensor would be 1 just as often."""
         if self.none:
             return flux
         p = -np.expm1(-flux)

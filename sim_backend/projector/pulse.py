@@ -9,18 +9,20 @@ and a medium of the backscatter coefficient b (scattering x phase function at 18
 
     g b  Q/(W r^2)  exp(-2 sigma r)                             (lidar equation, scattered once)
 
-They arrive 2 R/c and 2 r/c after the pulse left, blurred by a Gaussian of the pulse and the sensor's jitter together.
-Drops and flakes count as a medium of their mean backscatter. Ambient light and dark counts come evenly. sigma is the
-extinction without what is only turned forward, since a flash lights the neighbours' paths too.
+They arrive 2 R/c and 2 r/c after the pulse left, blurred by a Gaussian for the pulse and the sensor's jitter together.
+Drops and flakes are replaced by a medium of the same mean backscatter. Ambient light and dark counts are constant in
+time. sigma is the extinction without the light that is only scattered forward: what the path of one pixel loses in this
+way, it gains from the paths beside it, as the flash lights them too.
 
-Light scattered more than once multiplies both by 1 + M, with M from `beam_spread.totals` at the optical depth of R or r
-(as if all of the picture were that far away). On the surface's part it adds a detour, drawn from an exponential
-distribution of mean
+Light scattered more than once multiplies both by 1 + M. M is that of `beam_spread.totals` at the optical depth of R or
+r (as if all of the picture were that far away). The additional light of the surface has made a detour. Its length has
+an exponential distribution with the mean
 
     DETOUR (1 - mean cosine) (1 + DETOUR_GROWTH sigma R) R
 
-Against traced pulses (`tests/unit/sim_backend/projector/traced_pulses.py`) in fog of droplets 1 + M is right to 5 % for
-the surface and to 10 % for the medium up to an optical depth of 1, where it is 5.7 and 2.2, and to 20 % at 2.
+1 + M was compared with traced pulses in fog of droplets (`tests/unit/sim_backend/projector/traced_pulses.py`). Up to an
+optical depth of 1 it is right to 5 % for the surface and to 10 % for the medium; at 1 it is 5.7 and 2.2. At an optical
+depth of 2 it is right to 20 %.
 
 A pixel detects at most one photon per pulse. With the mean number L_i of detections in time bin i, the first one comes
 in bin i with the chance exp(-L_1 - ... - L_(i-1)) (1 - exp(-L_i)). Of n pulses, Binomial(n, 1 - exp(-L_1)) are detected
@@ -45,32 +47,32 @@ from sim_backend.scenes.medium import Rain, Snow
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 GATE_SIGMAS = 4.0
-"""Standard deviations of the blur by which the gate is wider than the depth range."""
+"""The gate is wider than the depth range by so many standard deviations of the blur."""
 MOST_BYTES = 1 << 31
 DETOUR, DETOUR_GROWTH = 0.08, 0.4
 """Mean detour as a share of the distance, for isotropic scattering, and its growth; fitted to traced pulses."""
 LATE_RISE, MORE_RISE = 2.0, 1.5
 """Approximate exponents with which light scattered more than once rises with the optical depth."""
 SHORTEST = 4.0
-"""Blur over mean detour above which all detours are taken to be alike."""
+"""Ratio of blur to mean detour above which all detours are taken to be the mean detour."""
 PART_M = 0.1
 """Length of the parts of a bin over which the medium's light is summed."""
 LONGEST_DETOURS = 30.0
-"""Mean detours after which all of a surface's light has arrived."""
+"""Number of mean detours after which all of a surface's light has arrived."""
 FAR_SIGMAS = 10.0
-"""Standard deviations of the blur beside a surface within which it counts."""
+"""Distance from a surface up to which its light is computed, in standard deviations of the blur."""
 LEAST_RANGE_M = 1e-3
 """Distance from which on the medium sends light back; keeps 1/r^2 finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echoes:
-    """Light that comes back of pulses to the pixels of chosen rows, float64 (rows, width).
+    """Light of pulses that comes back to the pixels of chosen rows, float64 (rows, width).
 
-    range_m: distance of the surface, infinite if there is none. surface_per_j: detections per joule of a pulse, of
-    light that was not scattered. late_per_j: of light that was, on a way longer by detour_m on average (there and back
-    together, halved). steady_per_s: without the source. fog: of the medium. stretch: smallest and largest distance per
-    depth.
+    range_m: distance of the surface, infinite if there is none. surface_per_j: detections of the surface per joule of a
+    pulse, by light that was not scattered. late_per_j: the same by light that was scattered. detour_m: half of the mean
+    length by which its way there and back is longer. steady_per_s: detections per second without the source. fog: light
+    of the medium. stretch: smallest and largest ratio of distance to depth.
     """
 
     range_m: Array
@@ -84,8 +86,10 @@ class Echoes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FogEcho:
-    """The medium's echo. per_j: detections per joule and per metre times r^2. optical: depths at which `more` (depths,)
-    holds, the light scattered more than once over exp(`MORE_RISE` depth) - 1; light scattered once = 1.
+    """The medium's echo.
+
+    per_j: detections per joule and per metre, times r^2. optical: optical depths (depths,). more: at these depths the
+    light scattered more than once, relative to light scattered once, divided by exp(`MORE_RISE` depth) - 1.
     """
 
     per_j: float
@@ -94,7 +98,7 @@ class FogEcho:
     more: Array
 
     def of_bins(self, opened: "Gate") -> Array:
-        """Detections per joule from parts of the gate's bins, float64 (bins, parts), without any surface."""
+        """Detections per joule in parts of the gate's bins, float64 (bins, parts), as if there were no surface."""
         per_s = 0.5 * LIGHT_M_PER_S
         parts = max(1, math.ceil(per_s * opened.bin_s / PART_M))
         step_m = per_s * opened.bin_s / parts
@@ -177,7 +181,7 @@ def blur_s(source: PulsedSource) -> float:
 
 
 def gate(source: PulsedSource, depth_range_m: tuple[float, float], stretch: tuple[float, float], bin_s: float) -> Gate:
-    """The gate that lets in light from a range of depths. stretch: smallest and largest distance per depth. Raises
+    """The gate for light from a range of depths. stretch: smallest and largest ratio of distance to depth. Raises
     ValueError for bins that are not positive or longer than the gate."""
     sigma_s = blur_s(source)
     start_s, end_s = (2 * z * q / LIGHT_M_PER_S for z, q in zip(depth_range_m, stretch, strict=True))
@@ -223,10 +227,11 @@ def _arrived(past_m: float, sigma_m: float, detour_m: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, mean: Array) -> None:
-    """Write into mean (bins,) the detections that a pulse makes on average in each bin, if none blinds the pixel.
+    """Write into mean (bins,) the average detections of a pulse in each bin, as if no photon made the pixel blind.
 
-    times: start, length and blur of bins in s. echo: (5,) detections by the surface, not scattered and scattered, its
-    distance, mean detour, and steady detections per second. fog: (bins, parts) detections by the medium.
+    times: in s, start of the first bin, length of a bin, and blur. echo: (5,), detections of the surface by light not
+    scattered and by light scattered, distance of the surface, mean detour, and steady detections per second. fog:
+    detections of the medium, (bins, parts).
     """
     start_s, bin_s, sigma_s = times
     surface, late, range_m, detour_m, steady_per_s = echo
@@ -256,7 +261,8 @@ def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, 
 
 @numba.njit(cache=True, nogil=True)
 def time_first(rng: np.random.Generator, pulses: int, mean: Array, counts: NDArray[np.uint32]) -> None:
-    """Draw counts (bins,) of first photons in so many pulses, from the mean detections (bins,) of a pulse."""
+    """Draw the number of first photons in each bin. pulses: their number. mean: detections of a pulse in each bin, on
+    average, (bins,). counts: the result, (bins,)."""
     left, wait = pulses, next_wait(rng)
     for i in range(len(mean)):
         found, wait = count(rng, wait, left, mean[i])

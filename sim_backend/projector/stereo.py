@@ -1,11 +1,12 @@
 """The scene from a second camera that stands where the light leaves the mirror, and what both cameras see of it.
 
 The second camera has the rays of the first, so it sees a point X in the direction X - S from the source S. The world
-has one depth per pixel of the first camera, and a tangent plane (facet). The strip of this plane that a pixel covers in
-its row goes to an interval of the second picture; of all strips there the nearest is seen, with the albedo at that very
-place. Rows are taken as rectified: a point is in the same row of both pictures, even if the source stands higher or
-nearer than the camera. Pixels to which nothing goes see places that are hidden from the first camera, and get what is
-next to them, of both sides the farther one. Cost: 40 ms for 512 x 512 pixels.
+has one depth per pixel of the first camera, and a tangent plane (facet). A pixel covers a strip of this plane in its
+row, and the strip covers an interval of the second picture. There the nearest of all strips is seen, with the albedo at
+that very place. Rows are assumed to be rectified: a point is in the same row of both pictures, even if the source
+stands higher or nearer than the camera. Some pixels of the second picture see places that are hidden from the first
+camera, so no strip covers them. They get the values of the nearest covered pixel to the left or to the right, of the
+two the one that is farther away from the camera. Computing time: 40 ms for 512 x 512 pixels.
 
 In ambient light alone a surface of albedo rho at the distance r has the radiance rho/pi E exp(-sigma r), and the air in
 front of it adds airlight, as in `sim_backend.effects.ambient`.

@@ -1,19 +1,18 @@
 """Light transport from a projector to the camera: what each column of the projector sends into each pixel.
 
-A column is the line of the scanner at the column's command. With F detections per second and watt in that column, a
-pattern of w_c watts in column c gives a pixel
+A column is the line of the scanner at the column's command. F_c is the number of detections of a pixel per second and
+per watt in column c. A pattern with w_c watts in column c gives the pixel
 
     steady + sum over c of w_c F_c        detections per second
 
-since light adds up. F is computed sheet by sheet by the effects that the scene calls for (`FluxModel`). A pattern with
-few lit columns is summed column by column, others are matrix products.
+since light adds up. F is computed column by column, with the effects that the scene calls for (`FluxModel`). A pattern
+with few lit columns is summed column by column; for others a matrix product is computed.
 
-Rain and snow change while patterns are shown. Drops and flakes stand still for a share of the time of a call, at least
-`HOLD_S`, of which there are about `MOMENTS`; the light that they send back at such a moment is kept as a sparse matrix.
-Moments recur after `MOMENTS` shares. Surfaces stand still.
+Rain and snow change while patterns are shown. The time of a call is divided into about `MOMENTS` equal parts, each at
+least `HOLD_S` long. Drops and flakes stand still within a part. The light that they send back in it is kept as a sparse
+matrix. After `MOMENTS` parts the same moments come again. Surfaces stand still.
 
-F is float32 (rows, columns, width), 1 kB per pixel for 500 columns and two bytes more. Times: see the page on
-simulation.
+F is float32 (rows, columns, width): 2 kB per pixel for 500 columns. For computing times see the page on simulation.
 """
 
 import math
@@ -45,29 +44,31 @@ Rows = NDArray[np.int64]
 Sparse = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Float32]
 
 MOMENTS = 8
-"""Number of moments at which rain and snow are looked at in a call."""
+"""Number of moments in a call at which the light of rain and snow is computed."""
 LEAVE_THE_ROW = ("halo", "forward blur")
-"""Effects that spread light over rows: those of a line's other rows make up for what leaves a row."""
+"""Effects that spread light over rows. In a line, a row gets as much from the other rows as it loses to them."""
 SPREAD, CORE = 2.0, 0.05
-"""A spot's halo at d pixels beside it along the row is spread over about `SPREAD` d + `CORE` f rows there, with the
-focal length f in pixels. From the bands of `beam_spread` (inverse Abel transform): right to 40 % for droplets up to an
-optical depth of 1, to a factor of 2 for isotropic scattering."""
+"""At a distance of d pixels along the row, the halo of a spot is spread over about `SPREAD` d + `CORE` f rows, with the
+focal length f in pixels. This follows from the bands of `beam_spread` (inverse Abel transform). It is right to 40 % for
+droplets up to an optical depth of 1, and to a factor of 2 for isotropic scattering."""
 KEPT_MOMENTS = 64
-"""Moments whose light is kept."""
+"""Number of moments whose light is kept in memory."""
 GROUP = 16
 """Neighbouring columns for which the drops are chosen together."""
 MOST_THREADS = 8
 MOST_COLUMNS = 4096
 SLACK = 1e-6
-"""Share of a step by which times may miss a multiple of it."""
+"""Error of rounding that is allowed for times, as a share of a step."""
 FEW = 8
 """A pattern that lights fewer than one in `FEW` columns is summed column by column."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Light of drops and flakes at one moment, sparse. Entries first[column, row] to first[column, row] + number
-    [column, row] - 1 are the pixels x (int32) and detections per second and watt `value` (float32) of that row."""
+    """Light of drops and flakes at one moment, as a sparse matrix.
+
+    first, number: of each column and row, the first entry and the number of entries. x, value: of each entry, the pixel
+    (int32) and the detections per second and watt (float32)."""
 
     first: NDArray[np.int64]
     number: NDArray[np.int64]
@@ -103,7 +104,7 @@ class Transport:
 
     @cached_property
     def spot_light(self) -> Float32:
-        """The part of `light` that comes from the column's part in the very row, (rows, columns, width)."""
+        """The part of `light` in each row that comes from the column's light in this row, (rows, columns, width)."""
         return self._computed(spots=True) if self._leaving else self.light
 
     def _computed(self, spots: bool) -> Float32:
@@ -141,8 +142,10 @@ class Transport:
             light[:, column] = rate[self.rows]
 
     def moments(self, start_s: float, ends_s: Array) -> tuple[list[Moment | None], Array]:
-        """The moments whose light successive patterns get, shown from start_s on until ends_s (patterns,), and their
-        shares of each pattern's time (moments, patterns). A scene that stands still has the one moment None."""
+        """Moments of rain and snow while patterns are shown one after the other.
+
+        The first pattern is shown from start_s on, each until its time in ends_s (patterns,). Returns the moments and
+        their shares of each pattern's time, (moments, patterns). A scene that stands still has the one moment None."""
         if not self._moving:
             return [None], np.ones((1, len(ends_s)))
         starts_s = np.concatenate([[start_s], ends_s[:-1]])
@@ -218,8 +221,10 @@ class Transport:
         return found
 
     def of_spots(self, rows: Rows, columns: Rows, moment: Moment | None) -> Float32:
-        """Detections per second and watt in a whole column, (n, width), from the parts of columns (n,) in rows (n,),
-        indices into `rows`. Each is seen in its own row only."""
+        """Detections of the pixels in the row of each spot, (n, width), per second and per watt in the whole column.
+
+        A spot is the part of column columns[i] in row rows[i], an index into the measured rows. It is seen in its own
+        row only. moment: with its drops and flakes."""
         found = self.spot_light[rows, columns]
         if moment is not None:
             for i, at in enumerate(zip(columns.tolist(), rows.tolist(), strict=True)):
@@ -300,8 +305,9 @@ def checked_rows(rows: ArrayLike, height: int) -> Rows:
 
 
 def checked_columns(columns: int, command_range: tuple[float, float], limits: tuple[float, float]) -> Array:
-    """Commands at the centres of columns that share a range of commands evenly, float64 (columns,). Raises ValueError
-    for fewer than 2 or more than `MOST_COLUMNS` columns, and for a range beyond the mirror's."""
+    """Commands at the centres of columns that divide a range of commands into equal parts, float64 (columns,).
+
+    Raises ValueError for fewer than 2 or more than `MOST_COLUMNS` columns, and for a range beyond the mirror's."""
     first, last = command_range
     if not 2 <= columns <= MOST_COLUMNS:
         raise ValueError(f"columns is {columns}; a projector has 2 to {MOST_COLUMNS}")
@@ -311,6 +317,6 @@ def checked_columns(columns: int, command_range: tuple[float, float], limits: tu
 
 
 def blocks(rows: int, patterns: int, width: int, most_bytes: int = 1 << 22) -> Iterator[slice]:
-    """Slices of rows whose light in all patterns takes about `most_bytes`."""
+    """Slices of rows. The light of a slice in all patterns takes about `most_bytes` of memory."""
     step = max(1, most_bytes // max(1, 4 * patterns * width))
     return (slice(first, min(first + step, rows)) for first in range(0, rows, step))

@@ -100,10 +100,11 @@ class LaserCase:
 
 @dataclass(frozen=True)
 class SyncCase:
-    """A sync source, open. `trigger` gives its input one scan marker; `pins` reads the outputs, also after close.
+    """A sync source that is open.
 
-    waiting: what its status says while a program waits. plays: its outputs follow the program; of a stand-in they are
-    low for good. step_s: long against the delays of its wire, so that the suite can look at each word.
+    trigger: sends one scan marker to its input. pins: reads its outputs, also after it is closed. waiting: state in its
+    status while a program waits. plays: whether its outputs follow the program; those of a stand-in always stay low.
+    step_s: time of a step of the program, much longer than the delays of the wire, so that the suite can see each step.
     """
 
     device: SyncSource
