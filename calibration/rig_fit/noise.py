@@ -160,8 +160,11 @@ def bin_starts(seen: Sighting, reach: float) -> NDArray[np.int64]:
 
 
 def tail_weight(normalised: Array, usual: float = 1 / MAD_TO_SD) -> Array:
-    """Weights of errors that are in units of their sd. usual: median of the absolute errors if the sd is right. If the
-    median is larger, the sd is taken to be too small."""
+    """Weights of errors for a robust fit: 1 for usual errors, less for large ones, 0 for outliers.
+
+    normalised: errors divided by their standard deviation. usual: median of their absolute values if the standard
+    deviation is right. If the median is larger, the standard deviation is assumed to be too small, and is raised.
+    """
     away = np.abs(normalised)
     if away.size:
         away = away / max(1.0, float(np.median(away)) / usual)

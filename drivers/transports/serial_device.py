@@ -14,7 +14,8 @@ class SerialLine(Protocol):
         """The port that it uses."""
 
     def send(self, command: str) -> None:
-        """Send a command as the device expects it, and wait for no reply. One that comes is not taken for another's."""
+        """Send a command as the device expects it, and do not wait for a reply. A reply that comes all the same is not
+        taken for that of a later command."""
 
 
 class SerialDevice(Device):
@@ -23,8 +24,8 @@ class SerialDevice(Device):
     _line: SerialLine
 
     def send(self, command: str) -> None:
-        """Send a raw command and wait for no reply; one that comes all the same is dropped. For commands that the
-        device does not answer, for which `ask` would wait in vain.
+        """Send a raw command that the device does not answer; `ask` would wait for a reply in vain. A reply that comes
+        all the same is dropped.
 
         Nothing is checked: such a command can make light or raise the gate. Raises `DeviceError` if the port is lost or
         takes nothing.

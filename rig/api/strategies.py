@@ -1,5 +1,6 @@
 """The call that measures depth in other ways beside the line scan: `compare_strategies`."""
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, Final, cast
 
@@ -21,6 +22,8 @@ AIRS: Final = ("clear", "50m", "20m", "10m", "rain", "snow")
 TIMES: Final = ("1ms", "10ms", "50ms", "200ms", "1s")
 RULES: Final[tuple[Rule, ...]] = ("energy", "irradiance")
 SCENES: Final = ("street", "ramp")
+LONGEST_S: Final = 100.0
+"""Longest measurement: 10 million frames of 10 us, which counters and estimators can hold."""
 SHARED: Final = ("scenes", "fogs", "repeat", "seed", "out")
 """Options of a trade-off that hold here too."""
 
@@ -46,9 +49,9 @@ def compare_strategies(
     loaded = configure(config)
     names = list(dict.fromkeys(request.strategies)) or [ALL]
     problems = _of_rig_and_request(loaded, request)
-    if names == [ALL]:  # our own way first
+    if ALL in names:  # our own way first
         names = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
-    airs, times = tuple(request.fogs) or AIRS, tuple(request.times) or TIMES
+    airs, times = _once(request.fogs) or AIRS, _once(request.times) or TIMES
     problems += air_problems(airs)
     times_s = []
     for text in times:
@@ -56,18 +59,28 @@ def compare_strategies(
             times_s.append(parse_quantity(text, "time"))
         except ValueError as wrong:
             problems.append(f"`times` {wrong}")
-    problems += [f"`times` has {t:g} s; a measurement takes more than 0 s" for t in times_s if t <= 0]
+    problems += [
+        f"`times` has {t:g} s; a measurement takes more than 0 s and at most {LONGEST_S:g} s"
+        for t in times_s
+        if not 0 < t <= LONGEST_S
+    ]
     with noted(problems):
         ways = each_or_problems(names, find_strategy)
     if problems:
         raise UsageError.of(problems)
     seeds = range(request.seed, request.seed + request.repeat)
-    rules = cast(tuple[Rule, ...], tuple(request.rules) or RULES)
-    asked = ComparisonPlan(tuple(request.scenes) or SCENES, airs, times_s, rules, request.rows, request.lux, seeds)
+    rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
+    scenes = _once(request.scenes) or SCENES
+    asked = ComparisonPlan(scenes, airs, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
     with RunFolder(request.out) as folder:
         return write_files(folder, run_comparison(loaded, ways, asked, progress))
+
+
+def _once(given: Sequence[str]) -> tuple[str, ...]:
+    """What is given, in its order, without repetitions."""
+    return tuple(dict.fromkeys(given))
 
 
 def _of_rig_and_request(config: Any, request: StrategiesRequest) -> list[str]:

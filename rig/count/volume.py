@@ -141,7 +141,7 @@ class Counter(Protocol):
         """Wait until the frames of all but the last `under_way` calls of `add` have been read."""
 
     def finish(self) -> FrameTally:
-        """The counted sweep. Call `reset` before the next one."""
+        """The counted sweep. Call `reset` before counting the next one."""
         ...
 
 

@@ -10,8 +10,9 @@ from one pixel to the next. So with the standard deviations of both stripes
 
     sd of inverse depth = s ((1 - f) sd_a + f sd_b)
 
-if neighbouring stripes err alike. Those of `joint` do: its depths then spread as much as stated where its stripes do.
-Errors that are independent of each other give down to 0.7 times this.
+if the errors of neighbouring stripes are the same. With `joint` they nearly are, so the depths are as exact as stated
+if the stripes are. If the errors are independent of each other, the standard deviation is smaller, down to 0.7 times
+this.
 `depth_rows` turns inverse depth w into depth 1 / w, whose standard deviation is that of w over w^2.
 `add_clear_rows` adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the
 stripes of a sweep.

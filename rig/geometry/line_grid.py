@@ -64,8 +64,10 @@ class LineGrid:
 
 
 def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
-    """The grid of a map, and the command plus line offset (columns,) of the columns' centres. `columns` must be a
-    multiple of the number of lines."""
+    """The grid of a map, and where each column lies: command of the mirror plus offset of the line, (columns,).
+
+    columns: number of columns, a multiple of the number of lines.
+    """
     lines = len(offsets)
     places = columns // lines
     first, last = command_range

@@ -182,7 +182,7 @@ class ReplayFacts:
         return 1e6 if pace.stepping else SILENCE_S / min(1.0, pace.speed or 1.0)
 
     def count_starts(self) -> int:
-        """Largest number of starts needed for the maps."""
+        """Largest number of starts of the SPAD that the maps may need."""
         return -(-self.maps // self._there) * len(self._played)
 
     def times(self, timing: SpadTiming) -> RecordedTimes | None:

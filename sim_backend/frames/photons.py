@@ -1,12 +1,12 @@
 """Binary frames from flux: exact Bernoulli bits, packed as in SPB1, the same for any block size and number of threads.
 
 Consecutive frames with the same light (one mirror position, power and time) form a span. For a span the sheet is
-traced, its flux summed and turned into levels (thresholds for random numbers, see `photon_kernels`), from which each
-frame is drawn. Rows are split over threads, each of which goes by itself through all spans of a block (or of one
-moment, if things move); steps work row by row, so the split does not matter. The sensor's effects on bits act on whole
-frames, and windows are cut out afterwards. Flux is float32 (rows, width), frames uint8 (frames, rows, row bytes).
-Measured for 512 x 512, the street in fog: 12 us a frame and 0.45 ms per mirror position on one core, 6.4 us and 0.26 ms
-on two (`python -m tests.benchmarks.simulator`).
+traced, and its flux is summed and turned into levels (thresholds for random numbers, see `photon_kernels`). Each frame
+is drawn from the levels. Each thread has some of the rows, and goes by itself through all spans of a block (or of one
+moment, if things move). All steps work row by row, so the result does not depend on the threads. The sensor's effects
+on bits act on whole frames, and windows are cut out afterwards. Flux is float32 (rows, width), frames uint8 (frames,
+rows, row bytes). Measured for 512 x 512 pixels, the street in fog: 12 us per frame and 0.45 ms per mirror position on
+one core, 6.4 us and 0.26 ms on two (`python -m tests.benchmarks.simulator`).
 """
 
 from collections.abc import Callable, Iterable

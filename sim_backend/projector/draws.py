@@ -50,7 +50,7 @@ def inverted(uniform: float, frames: int, flux: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def next_wait(rng: np.random.Generator) -> float:
-    """An exponential variate: the sum of mean counts, pixel after pixel, at which the next pixel fires."""
+    """An exponential variate. Mean counts are added up from pixel to pixel; where the sum reaches it, a pixel fires."""
     return -math.log(1.0 - rng.random())
 
 

@@ -55,11 +55,13 @@ BETA: Final = 0.5
 
 
 class AnswerSettings(NamedTuple):
-    """Tables of `answer_settings`. stripes: labels 0..stripes-1 are positions, those behind are padding.
+    """Tables of `answer_settings`. For r and w see the module's docstring.
 
-    weights: float32 (256,), by a total's excess over the least. powers: float32 (REACH + 1, TAPS, POWERS), powers of
-    the distance for each r, 0 beyond it. reach: uint8 (2^TAPS,), r if those of the TAPS labels around the winner whose
-    bits are set are excluded. near: uint8 (VECTOR,), LARGEST for labels too near a winner at MIDDLE to be its rivals.
+    stripes: number of labels that are positions; labels from there on are padding. weights: w by the difference of a
+    total from the least one, float32 (256,). powers: for each r, powers of the distance from the winner, 0 for labels
+    farther away than r, float32 (REACH + 1, TAPS, POWERS). reach: r by a number of TAPS bits, which are set for labels
+    around the winner that are excluded, uint8 (2^TAPS,). near: for a winner at MIDDLE, LARGEST for labels that are too
+    near to be its rivals, else 0, uint8 (VECTOR,).
     """
 
     stripes: int
