@@ -70,9 +70,12 @@ Loaded = TypeVar("Loaded")
 
 
 def config_of(kind: type[Config], **fields: object) -> Config:
-    """The config of a device that is opened by itself, without a file. A key with a unit takes text, as in a file, or,
-    with that unit added to its name, a number in SI units: `max_power_w=0.05`. One with a unit that is None counts as
-    not given. Raises `LimitExceeded`, with one line, for the first wrong field."""
+    """The config of a device that is opened by itself, without a file.
+
+    A field with a unit takes text, as in a file: `max_power="50 mW"`. Or the unit is added to its name, and it takes a
+    number in SI units: `max_power_w=0.05`; None counts as not given. Raises `LimitExceeded`, with one line, for the
+    first wrong field.
+    """
     for name, about in kind.model_fields.items():
         dimension = dimension_of(about)
         if dimension is None:

@@ -100,7 +100,7 @@ class IbeamFraming:
         return SERIAL.fullmatch(reply) is not None
 
     def asks(self, command: str) -> bool:
-        """Whether it is a question."""
+        """Whether a command only asks for something."""
         return command.startswith(("sta", "sh", "version"))
 
     def encode(self, command: str) -> bytes:

@@ -62,9 +62,7 @@ class TcpStream:
                 ) from None
 
     def receive(self, deadline_s: float) -> bytes:
-        """The bytes that have come, at least one; b"" if nothing came within the deadline. May raise
-        `DeviceDisconnected`.
-        """
+        """The bytes that have arrived; b"" if none arrived within the deadline. May raise `DeviceDisconnected`."""
         buffer = bytearray(_CHUNK_BYTES)
         return bytes(buffer[: self.receive_into(memoryview(buffer), deadline_s)])
 

@@ -7,14 +7,14 @@ rig is its `ColumnGeometry`: where a column of light lies in space.
 """
 
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
-from typing import Final, Literal, Protocol, runtime_checkable
+from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.model.rig_model import RigModel
 from drivers.errors import UnknownKind
+from drivers.optional_packages import added
 from drivers.registry import load_entry
 from rig.errors import UsageError
 from rig.geometry.bent_light import is_bent
@@ -209,19 +209,21 @@ def _rows_of(whole: SweepGeometry, rows: NDArray[np.int64]) -> SweepGeometry:
 
 def strategy_names() -> tuple[str, ...]:
     """Names of all installed strategies, sorted. Imports none of them."""
-    return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
+    return tuple(sorted({entry.name for entry in added(GROUP)}))
 
 
 def find_strategy(name: str) -> Strategy:
     """The strategy of this name.
 
     Raises UsageError, with a message of one line, if there is none, if two packages offer it, if it cannot be loaded,
-    or if it calls itself by another name.
+    if it calls itself by another name, or if its light is none of `Light`.
     """
     try:
-        found = load_entry("strategies", name, entry_points(group=GROUP), Strategy)  # type: ignore[type-abstract]
+        found = load_entry("strategies", name, added(GROUP), Strategy)  # type: ignore[type-abstract]
     except UnknownKind as error:
         raise UsageError(str(error)) from error
     if found.name != name:
         raise UsageError(f"strategies: kind {name!r} calls itself {found.name!r}; its package must use one name")
+    if found.light not in get_args(Light):
+        raise UsageError(f"strategies: {name} has light {found.light!r}; it is one of {', '.join(get_args(Light))}")
     return found

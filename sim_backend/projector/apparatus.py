@@ -266,7 +266,7 @@ class SimulatedApparatus:
 
 
 def rows_of_fan(setting: Setting) -> Array:
-    """Number of rows over which the line's fan would spread if all were as high as a row, float64 (rows,)."""
+    """For each row, the height of the line's fan divided by the height of the row, float64 (rows,)."""
     view = setting.view
     tangent = view.v[:, view.width // 2]
     return np.asarray(setting.line.fan * (1 + tangent**2) / np.abs(np.gradient(tangent)))

@@ -41,7 +41,7 @@ def write_files(folder: RunFolder, done: Comparison) -> Comparison:
 
 
 def csv_text(rows: Sequence[StrategyRow]) -> str:
-    """Rows, at least one, as CSV, one line each, with the columns of the JSON."""
+    """The rows as CSV, one line each, with the columns of the JSON file. rows: at least one."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, asdict(rows[0]), lineterminator="\n")
     writer.writeheader()
