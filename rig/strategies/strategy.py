@@ -39,8 +39,8 @@ class TooShort(Exception):  # noqa: N818 - not an error: the comparison shows th
 class Answer:
     """Depth that a strategy found. depth_m: float32 (rows, width), z in metres, NaN where there is no answer.
 
-    confidence: float32 (rows, width), 0 to 1, the strategy's own estimate of the probability that the depth is right; 0
-    where there is no answer.
+    confidence: float32 (rows, width), 0 to 1, the strategy's own estimate of the probability that the depth is within
+    2 % of the true one; 0 where there is no answer.
     """
 
     depth_m: Float32

@@ -1,4 +1,4 @@
-"""Measures the same scenes with every strategy, that is, in every way to measure depth, and tabulates the results.
+"""Measures the same scenes with every strategy (a way to measure depth), and tabulates the results.
 
 Every measurement has the same camera, the same power of its source, the same ambient light and the same time. All are
 repeated with each seed. A row of the table is one strategy in one scene and air, with one rule and time.
@@ -24,8 +24,8 @@ from rig.errors import RigError, UsageError
 from rig.plan.scan_plan import column_command
 from rig.progress import part, tell_stage
 from rig.simd import Float32, Float64
-from rig.strategies.apparatus import Budget, MakesApparatus, Rule
-from rig.strategies.comparison.eye_safety import Field, LaserClass, class_of
+from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule
+from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
 from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
 from rig.strategies.comparison.score import GOOD, Score, score, scored_pixels
 from rig.strategies.strategy import Answer, ColumnGeometry, Light, Strategy, TooShort
@@ -41,8 +41,8 @@ BINS_PER_E: Final = 10.0
 """Bins of distance, per factor of e: 10 % wide."""
 FEWEST: Final = 30
 """Least number of pixels in a bin of distance; a bin with fewer is not used."""
-PULSE_S: Final = 1e-10
-"""Length of a flash, for its laser class only."""
+PULSE_S: Final = 5e-10
+"""Length of a flash, for its laser class only; the class is the same for 10 ps to 5 us."""
 GREEN_M: Final = 520e-9
 WIDE_FAN_RAD: Final = math.radians(50)
 
@@ -76,7 +76,7 @@ class StrategyRow:
     of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance at which
     90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms: sensor time. energy_mj: energy of
     the light. compute_s: computing time, simulation included. laser_class, laser_class_still: of the source while it
-    works, and if it stood still; None without a source.
+    works, and if it stood still; None without a source, or if its light is not visible.
     """
 
     strategy: str
@@ -196,15 +196,22 @@ def _of_place(
         if not scored.any():
             raise UsageError(f"scene {place[0]}: the source lights nothing that the camera sees; check the scene")
 
-        def measure(way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, float, float]:
+        def apparatus_of(rule: Rule, seed: int) -> Apparatus:
             try:
-                apparatus = opened.apparatus(
+                made: Apparatus = opened.apparatus(
                     rows=rows, columns=columns, command_range=scan.command_range, power_w=power_w, rule=rule, seed=seed,
                     depth_range_m=scan.depth_range, spad_frame_s=frame_s,
                 )  # fmt: skip
             except DeviceError as error:
                 raise UsageError(f"scene {place[0]}: {error}") from error
+            except ValueError as error:  # the config asks for what no apparatus has
+                raise UsageError(f"{config.name}: {error}") from error
+            return made
+
+        def measure(way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, float, float]:
+            apparatus = apparatus_of(rule, seed)
             answer = way.measure(apparatus, geometry, Budget(time_s), seed)
+            require_form(answer, way.name, geometry.shape)
             spent = apparatus.spent
             if spent.time_s > time_s * (1 + OVERSPENT):
                 raise RigError(
@@ -212,6 +219,7 @@ def _of_place(
                 )
             return answer, spent.time_s, spent.energy_j
 
+        apparatus_of(asked.rules[0], asked.seeds[0])  # light that all ways share is on nobody's computing time
         for rule, time_s, way in product(asked.rules, asked.times_s, ways):
             tell_stage(f"{way.name}, {time_s * 1e3:g} ms")
             row = StrategyRow(way.name, way.light, *place, rule, 1e3 * time_s, len(true_m))
@@ -231,6 +239,21 @@ def _of_place(
                 continue
             row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=1e3 * spent_s)
             yield replace(row, energy_mj=1e3 * energy_j, compute_s=time.perf_counter() - begun)
+
+
+def require_form(answer: Answer, name: str, shape: tuple[int, int]) -> None:
+    """Raise RigError, one line, if a strategy's answer is not what `Answer` says. shape: (rows, width)."""
+    if not isinstance(answer, Answer):
+        raise RigError(f"{name} answers with {type(answer).__name__}; it must return a rig.strategies.strategy.Answer")
+    for field, values in (("depth_m", answer.depth_m), ("confidence", answer.confidence)):
+        if np.shape(values) != shape or np.asarray(values).dtype != np.float32:
+            raise RigError(
+                f"{name} answers with a {field} of {np.asarray(values).dtype} and shape {np.shape(values)}; "
+                f"it must be float32 (rows, width) = {shape}, for the rows that were measured"
+            )
+    given = np.isfinite(answer.depth_m)
+    if not np.all((answer.confidence >= 0) & (answer.confidence <= 1)) or np.any(answer.confidence[~given] != 0):
+        raise RigError(f"{name} has a confidence that is not 0 to 1, or not 0 where depth_m is NaN; correct it")
 
 
 def _means(scores: Sequence[Score]) -> dict[str, Any]:
@@ -276,17 +299,20 @@ class Reached:
 def _classes(
     config: RigConfig, geometry: ColumnGeometry, light: Light, power_w: float, rule: Rule, time_s: float
 ) -> tuple[LaserClass | None, LaserClass | None]:
-    """Laser classes of a source while it works, and if it stood still."""
+    """Laser classes of a source while it works, and if it stood still; None without one, or for invisible light."""
     if light == "ambient":
         return None, None
     line: Any = getattr(config.world, "line", None)
     wavelength_m = float(getattr(line, "wavelength", GREEN_M))
+    if not VISIBLE_M[0] <= wavelength_m <= VISIBLE_M[1]:
+        return None, None
     fan_rad = float(getattr(line, "fan", WIDE_FAN_RAD))
     normals: Float64 = geometry.model.planes(geometry.commands[[0, -1]])[:, :3]
     scan_rad = math.acos(min(1.0, abs(float(normals[0] @ normals[1]))))
     height = geometry.model.camera.height
-    if rule == "irradiance" and light in ("line", "spot"):
-        power_w /= geometry.columns / 2 * (height if light == "spot" else 1)
+    if rule == "irradiance":  # a pattern lights half of the columns with the whole power
+        lit = {"line": 1.0, "spot": 1 / height, "flash": float(geometry.columns)}
+        power_w *= lit.get(light, geometry.columns / 2) / (geometry.columns / 2)
     field = Field(power_w, fan_rad, scan_rad)
     beams = {
         "spot": field.spot(time_s, height),

@@ -14,14 +14,14 @@ from calibration.files.rig_file import load_rig_model
 from rig.api import compare_strategies
 from rig.errors import RigError, UsageError
 from rig.strategies.comparison import compare
-from rig.strategies.comparison.compare import Comparison, Reached, StrategyRow, ranges, run_comparison
+from rig.strategies.comparison.compare import Comparison, Reached, StrategyRow, ranges, require_form, run_comparison
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
 from rig.strategies.comparison.places import air_problems, scene_file, visibility_m
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
 from tests.system import small_rig
 
-covers(visibility_m, scene_file, Reached, Comparison, run_comparison, ranges)
+covers(visibility_m, scene_file, Reached, Comparison, require_form, run_comparison, ranges)
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +141,59 @@ def test_a_way_that_overspends_is_an_error(config, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (None, "greedy answers with NoneType; it must return"),
+        (Answer(np.ones((3, 2), np.float32), np.ones((2, 3), np.float32)), r"depth_m of float32 and shape \(3, 2\)"),
+        (Answer(np.ones((2, 3), np.float32), np.ones((2, 3))), "confidence of float64"),
+        (Answer(np.ones((2, 3), np.float32), np.full((2, 3), np.nan, np.float32)), "not 0 to 1"),
+        (Answer(np.full((2, 3), np.nan, np.float32), np.ones((2, 3), np.float32)), "not 0 where depth_m is NaN"),
+    ],
+)
+def test_an_answer_of_another_form_is_an_error_of_its_strategy(answer, said):
+    with pytest.raises(RigError, match=said):
+        require_form(answer, "greedy", (2, 3))
+    nothing = np.zeros((2, 3), np.float32)
+    require_form(Answer(nothing * np.nan, nothing), "whole", (2, 3))
+
+
+def test_repetitions_are_measured_once_and_all_may_stand_beside_names(config, monkeypatch):
+    monkeypatch.setattr("rig.api.strategies.strategy_names", lambda: ("gray-spad",))
+    found = compare_strategies(
+        config, strategies=["all", "gray-spad"], times=["2ms", "0.002 s"], rules=["energy", "energy"],
+        scenes=["ramp", "ramp"], fogs=["clear", "clear"], rows=4,
+    )  # fmt: skip
+    assert [row.strategy for row in found.rows] == ["gray-spad"]
+
+
+def changed(config, **keys):
+    """A copy of the config, beside it, with other values of its world's line or its scan."""
+    content = yaml.safe_load(config.read_text())
+    for section, values in keys.items():
+        place = content["world"] if section == "line" else content
+        place[section] = {**place.get(section, {}), **values}
+    file = config.with_name("changed.yaml")
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def test_invisible_light_has_no_class_and_more_columns_than_a_projector_has_are_said(config):
+    asked = {"strategies": ["gray-spad"], "times": ["2ms"], "scenes": ["ramp"], "fogs": ["clear"], "rules": ["energy"]}
+    (dark,) = compare_strategies(changed(config, line={"wavelength": "850 nm"}), **asked, rows=4).rows
+    assert (dark.laser_class, dark.laser_class_still) == (None, None)
+    with pytest.raises(UsageError, match="columns is 4800; a projector has 2 to 4096"):
+        compare_strategies(changed(config, scan={"columns": 4800}), **asked, rows=4)
+
+
+def test_a_flash_of_equal_irradiance_has_twice_the_power(config, monkeypatch):
+    seen = []
+    monkeypatch.setattr(compare, "class_of", lambda beam, wavelength_m: seen.append(beam.mean_w) or "1")
+    compare_strategies(config, strategies=["lidar-peak"], times=["2ms"], scenes=["ramp"], fogs=["clear"], rows=4)
+    energy_w, _, irradiance_w, _ = seen
+    assert irradiance_w == pytest.approx(2 * energy_w)
+
+
+@pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"strategies": ["nonsense"]}, "nonsense"),
@@ -148,6 +201,7 @@ def test_a_way_that_overspends_is_an_error(config, monkeypatch):
         ({"fogs": ["0 m"]}, "no air"),
         ({"times": ["fast"]}, "times"),
         ({"times": ["0 s"]}, "more than 0 s"),
+        ({"times": ["101 s"]}, "at most 100 s"),
         ({"rules": ["fair"]}, "energy and irradiance"),
         ({"rows": 0}, "at least one row"),
         ({"lux": -1.0}, "lux"),

@@ -1,5 +1,6 @@
 """Geometry of columns and the registry: depth and column are inverse, and names lead to one strategy or one line."""
 
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from calibration.model.light_sheet import depth as exact_depth
 from rig.errors import UsageError
 from rig.strategies import strategy as module
+from rig.strategies.line_scan import JOINT
 from rig.strategies.strategy import ColumnGeometry, Strategy, find_strategy, strategy_names
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plain_scene import COLUMNS, RANGE_M, plain_geometry, plain_rig
@@ -76,6 +78,9 @@ def test_every_name_leads_to_a_strategy_that_has_it():
     assert all(isinstance(find_strategy(name), Strategy) for name in names)
 
 
+STRIPED = replace(JOINT, name="striped", light="stripes")
+
+
 def test_unknown_broken_and_doubled_names_are_said_in_one_line(monkeypatch):
     group = module.GROUP
     entries = [
@@ -84,10 +89,11 @@ def test_unknown_broken_and_doubled_names_are_said_in_one_line(monkeypatch):
         EntryPoint("twice", "rig.strategies.line_scan:EDGE", group),
         EntryPoint("other", "rig.strategies.line_scan:JOINT", group),
         EntryPoint("number", "math:pi", group),
+        EntryPoint("striped", f"{__name__}:STRIPED", group),
     ]
-    monkeypatch.setattr(module, "entry_points", lambda group: entries)
+    monkeypatch.setattr(module, "added", lambda group: entries)
     for name, said in (("gone", "cannot be loaded"), ("twice", "offered twice"), ("other", "calls itself"),
-                       ("number", "is no"), ("none", "unknown kind")):  # fmt: skip
+                       ("number", "is no"), ("none", "unknown kind"), ("striped", "one of spot")):  # fmt: skip
         with pytest.raises(UsageError, match=said) as error:
             find_strategy(name)
         assert "\n" not in str(error.value)
