@@ -170,7 +170,11 @@ def passage_rows(
     model: RigModel, terms: Terms, timing: Array, pose: BoardPose, rays: Array, command: Array, y_px: Array,
     velocity_per_s: Array,
 ) -> Rows:  # fmt: skip
-    """Rows of passages with rays (2, m), in units of the command. timing: (3,) both lags and row delay."""
+    """Rows of the least-squares fit, one for each of m passages, in units of the command.
+
+    timing: both lags and the row delay, (3,). rays: u and v of the passages' pixels, (2, m). command, y_px,
+    velocity_per_s: of the passages, (m,).
+    """
     assert isinstance(model.scanner, PivotScanner)
     u, v = rays
     ray = np.stack([u, v, np.ones_like(u)], axis=-1)

@@ -230,7 +230,7 @@ class DacScanner(BeamScanner):
 
     @property
     def identity(self) -> str:
-        """The board's name and what it tells of itself."""
+        """The board's name, and what it reports about itself."""
         return self._dac.identity
 
     @property

@@ -21,11 +21,12 @@ from rig.threads import RowWorkers
 
 
 class DepthMap(NamedTuple):
-    """Depth on the camera grid, with what it is worth; all arrays float32 (rows, width).
+    """Depth on the camera grid, with its confidence and its error; all arrays float32 (rows, width).
 
-    depth_m: z in metres, NaN where there is none. confidence: the lower one of the two stripes between which the pixel
-    lies, 0 where there is no depth. depth_sd_m: standard deviation of the depth in metres, NaN where there is none. It
-    follows from `x_sd_px` of these two stripes: it holds if they are the right ones, without the calibration's error.
+    depth_m: z in metres, NaN where there is none. confidence: the lower confidence of the two stripes between which the
+    pixel lies, 0 where there is no depth. depth_sd_m: standard deviation of the depth in metres, NaN where there is
+    none. It follows from `x_sd_px` of these two stripes, provided that they are the right ones. The calibration's error
+    is not in it.
     """
 
     depth_m: Float32

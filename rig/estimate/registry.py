@@ -1,6 +1,6 @@
 """Stripe estimators by name. An estimator turns the counts of a sweep into a stripe table.
 
-Those of other packages are entry points of the group `spadrig.estimator`, each of which loads an `EstimatorKind`.
+Estimators of other packages are entry points of the group `spadrig.estimator`. Each loads an `EstimatorKind`.
 
 `create_estimator` makes one that has learned nothing yet. `recalling` makes one that estimates earlier maps again, bit
 for bit, from the learned state that was kept with each of them.

@@ -68,7 +68,7 @@ def bow_per_rad(model: RigModel) -> float:
 
 
 def is_bent(model: RigModel) -> bool:
-    """Whether this model's depth needs more than planes and rays."""
+    """Whether light of this model is bent: its sheets bow, or rows are exposed one after the other."""
     return model.row_delay_s != 0 or bow_per_rad(model) != 0
 
 

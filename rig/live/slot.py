@@ -2,14 +2,15 @@
 
 The run writes and never waits; readers copy. Each section has two buffers, used by turns. `begun` is set to the number
 of a value before its first byte is written, `number` after its last one. A reader copies the buffer of `number`; the
-copy is whole if `begun` has advanced by less than 2 by then, and has the checksum that was written with it. So a writer
-that dies in the middle leaves the last whole value, and a reader that hangs or dies leaves nothing. Copying 5 MB takes
-a millisecond.
+copy is whole if `begun` has advanced by less than 2 by then, and has the checksum that was written with it. If a writer
+dies in the middle, the last whole value remains. A reader that hangs or dies holds nothing up. Copying 5 MB takes a
+millisecond.
 
 Layout (little-endian). The first page is the only one that readers write: int64 time of the last heartbeat
-(CLOCK_MONOTONIC, ns), image row that a reader follows, time of that wish, and whether a stop is requested. The second
-page: whether the run is over, then in 64 bytes for each section `begun` and `number`. Then the description, as JSON,
-after its length. Then the buffers, sparse: while nobody watches, they take no memory.
+(CLOCK_MONOTONIC, ns), image row that a reader wants to follow, time of that wish, and whether a stop is requested. The
+second page has whether the run is over, then 64 bytes for each section with `begun` and `number`. Then come the length
+of the description and the description as JSON, then the buffers. The file is sparse: while nobody watches, the buffers
+take no memory.
 """
 
 import json
@@ -230,7 +231,7 @@ class SlotReader:
 
     @staticmethod
     def newest() -> RunningSlot | None:
-        """The run that was begun last of those that are going on; None if there is none."""
+        """The run that began last, of those that are going on; None if there is none."""
         return next(iter(SlotReader.running()), None)
 
     @classmethod

@@ -172,7 +172,7 @@ class Monitor:
         return self._reader.skipped
 
     def end(self, timeout_s: float) -> bool:
-        """Stop showing blocks. False if the callback does not return; it is then abandoned with its thread."""
+        """Stop showing blocks. Returns False if the callback does not return in time; its thread then goes on."""
         self._over.set()
         ended = self.thread.join(timeout_s)
         if not ended:
