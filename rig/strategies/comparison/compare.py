@@ -324,7 +324,7 @@ def _classes(
 
 
 def ranges(rows: Sequence[StrategyRow], scene: str) -> dict[tuple[str, float, Rule], dict[str, float | None]]:
-    """Range in metres by (strategy, time in ms, rule) and air, in one scene. Only air of a known visibility."""
+    """Range in metres by (strategy, time in ms, rule) and air, in one scene, for air with a known visibility."""
     found: dict[tuple[str, float, Rule], dict[str, float | None]] = {}
     for row in rows:
         if row.scene == scene and row.air is not None and visibility_m(row.air) is not None and row.too_short is None:
