@@ -284,7 +284,7 @@ class CameraFit:
 
     @property
     def kept(self) -> tuple[str, ...]:
-        """Names of the views in the fit, even if only a part of their corners is."""
+        """Names of the views with at least one corner in the fit."""
         return _of_used(self.views, self.used)
 
     @property

@@ -93,7 +93,7 @@ def error_message(error: BaseException) -> list[str]:
 
 
 def error_from(message: list[str]) -> DeviceError:
-    """The error that a message carries. If its class is not in `drivers.errors`: a `ProtocolError` that blames the
+    """The error that a message carries, or, if its class is not in `drivers.errors`, a `ProtocolError` that blames the
     guard."""
     name, text = message
     kind = getattr(drivers.errors, name, None)

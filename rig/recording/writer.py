@@ -308,7 +308,7 @@ class WritesBlocks(Protocol):
 
     @property
     def keep_blocks(self) -> int:
-        """Blocks that are held in the ring although they are written or not to be written."""
+        """Number of newest blocks that are kept in the ring, even if they need not be written."""
         ...
 
     def begin(self, sweeps: int) -> None:
@@ -316,7 +316,7 @@ class WritesBlocks(Protocol):
         ...
 
     def holds(self, ring: BlockRing) -> int:
-        """Blocks of the ring that `write_from` keeps at a time."""
+        """Number of blocks of the ring that `write_from` holds at a time."""
         ...
 
     def write_from(self, reader: RingReader) -> None:

@@ -140,7 +140,8 @@ NOBODY = Listeners()
 class Monitor:
     """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives.
 
-    watched: tells whether anybody looks; meanwhile nothing is summed and no slot of the ring is occupied. None: always.
+    watched: returns whether anybody looks. While nobody does, nothing is summed and no slot of the ring is occupied.
+    None: somebody always looks.
     """
 
     def __init__(

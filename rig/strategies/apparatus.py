@@ -89,8 +89,8 @@ class Apparatus(Protocol):
     def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
         """Take one image with each of two conventional cameras, in ambient light only: (2, rows, width).
 
-        The second camera stands where the light source is, and looks in the same direction as the first. Both are
-        without the narrow filter.
+        The second camera stands beside the first, as far left or right as the light source, and looks in the same
+        direction. Both are without the narrow filter.
         """
         ...
 

@@ -41,7 +41,7 @@ MIN_CONFIDENCE: Final = 0.5
 
 
 def frames_within(budget: Budget, frame_s: float) -> int:
-    """Number of whole frames within a budget. A frame that is too long by a millionth, from rounding, is whole."""
+    """Number of whole frames within a budget, also if it is too short by a millionth of a frame because of rounding."""
     return math.floor(budget.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 

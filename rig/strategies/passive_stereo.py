@@ -1,14 +1,15 @@
 """Passive stereo: two cameras in ambient light, matched by OpenCV's semi-global matcher (StereoSGBM).
 
-The second camera stands where other strategies have their light source, so the baseline is the same. A point at depth z
+The second camera stands level with the first, as far left or right as the light source of other strategies, so the
+baseline is the same. A point at depth z
 is seen with a disparity d = b f / z. An error dd of the disparity becomes an error of the depth of
 
     dz = z^2 / (b f) dd.
 
 The matcher finds disparities in sixteenths of a pixel, but they lie up to 0.2 px too close to whole pixels. So the
 place between whole pixels is taken from the blocks around a pixel (`rig.strategies.block_matching`), and so is the
-confidence. The matcher's preference for smooth surfaces has no part in either. If the cameras do not stand side by
-side, or if the lens distorts, the pictures are first rectified by OpenCV.
+confidence. The matcher's preference for smooth surfaces has no part in either. If the lens distorts, the pictures are
+first rectified by OpenCV.
 
 Fog lowers the contrast of both pictures and adds smooth light of its own. So the local mean is subtracted from the
 pictures before the matcher gets them, and the rest is stretched to 8 bits.
@@ -43,22 +44,18 @@ FULL_SIGMAS: Final = 3.0
 SUB_PIXEL_PX: Final = 0.1
 """Standard deviation of the matcher's interpolation between whole pixels (Shimizu and Okutomi, ICCV 2001: its error
 goes up to 0.15 px)."""
-ALIGNED: Final = 1e-4
-"""Offset of the second camera up, down or ahead, divided by the baseline. Below it rows are the same in both pictures,
-to a tenth of a pixel in a thousand."""
 
 
 class Rectified(NamedTuple):
     """How pictures of two cameras are rectified.
 
     focal_baseline: b f in pixels times metres, positive if the second camera stands on the right of the first, else
-    negative. maps: for `cv2.remap`, of both cameras; None if the pictures need no change. turn: rotation (3, 3) from
-    the camera's frame to the rectified one. matrix: (3, 3) of the rectified camera.
+    negative. maps: for `cv2.remap`, of both cameras; None if the pictures need no change. matrix: (3, 3) of the
+    rectified camera, which looks in the same direction.
     """
 
     focal_baseline: float
     maps: tuple[tuple[Any, Any], ...] | None
-    turn: Float64
     matrix: Float64
 
 
@@ -73,15 +70,15 @@ def rectified(model: RigModel) -> Rectified:
             f"the source stands at {None if second is None else second.tolist()} m; stereo along rows needs it mainly "
             "left or right of the camera: give source_m in the calibration"
         )
-    if not np.any(camera.distortion) and np.hypot(second[1], second[2]) <= ALIGNED * abs(second[0]):
-        return Rectified(float(second[0] * camera.matrix[0, 0]), None, np.eye(3), camera.matrix)
+    if not np.any(camera.distortion):
+        return Rectified(float(second[0] * camera.matrix[0, 0]), None, camera.matrix)
     size, lens = (camera.width, camera.height), (camera.matrix, camera.distortion)
-    turned = cv2.stereoRectify(*lens, *lens, size, np.eye(3), -np.asarray(second, np.float64)[:, None], alpha=-1)
+    turned = cv2.stereoRectify(*lens, *lens, size, np.eye(3), np.array([[-second[0]], [0.0], [0.0]]), alpha=-1)
     maps = tuple(
         cv2.initUndistortRectifyMap(*lens, turn, matrix[:, :3], size, cv2.CV_32FC1)
         for turn, matrix in ((turned[0], turned[2]), (turned[1], turned[3]))
     )
-    return Rectified(float(-turned[3][0, 3]), maps, np.asarray(turned[0], np.float64), np.asarray(turned[2][:, :3]))
+    return Rectified(float(-turned[3][0, 3]), maps, np.asarray(turned[2][:, :3], np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +117,8 @@ def depth_of_pair(pair: Float32, geometry: ColumnGeometry) -> Answer:
     disparity, sure = _matched(pair, rows, how.focal_baseline, ((1 - BEYOND) / far_m, (1 + BEYOND) / near_m))
     if how.maps is not None:
         disparity, sure = _on_raw_pixels(disparity, sure, how, geometry)
-    scale = _z_per_rectified(how, geometry)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = abs(how.focal_baseline) / disparity / scale
+        depth = abs(how.focal_baseline) / disparity
         inside = (1 / depth >= (1 - BEYOND) / far_m) & (1 / depth <= (1 + BEYOND) / near_m)
     good = inside & ~geometry.defects
     return Answer(np.where(good, depth, np.nan).astype(np.float32), np.where(good, sure, 0).astype(np.float32))
@@ -198,24 +194,13 @@ def _shifted(second: Float32, least: int, number: int) -> Iterator[tuple[Float32
         yield moved, possible
 
 
-def _rectified_rays(how: Rectified, geometry: ColumnGeometry) -> Float64:
-    """The rays of the raw pixels in the rectified frame, (3, rows, width), not scaled."""
-    rays = np.stack([geometry.u, geometry.v, np.ones_like(geometry.u)]).astype(np.float64)
-    return np.asarray(np.einsum("ij,jyx->iyx", how.turn, rays))
-
-
-def _z_per_rectified(how: Rectified, geometry: ColumnGeometry) -> Float64:
-    """Depth in the rectified frame over depth in the camera's, (rows, width)."""
-    return np.asarray(_rectified_rays(how, geometry)[2])
-
-
 def _on_raw_pixels(
     disparity: Float64, sure: Float64, how: Rectified, geometry: ColumnGeometry
 ) -> tuple[Float64, Float64]:
     """Disparity and confidence at the raw pixels (rows, width), those of the nearest rectified pixel."""
-    rays = _rectified_rays(how, geometry)
     with np.errstate(invalid="ignore"):
-        x, y = (np.rint(how.matrix[i, i] * rays[i] / rays[2] + how.matrix[i, 2]) for i in (0, 1))
+        x = np.rint(how.matrix[0, 0] * geometry.u + how.matrix[0, 2])
+        y = np.rint(how.matrix[1, 1] * geometry.v + how.matrix[1, 2])
         inside = (x >= 0) & (x < disparity.shape[1]) & (y >= 0) & (y < disparity.shape[0])
     at = np.where(inside, y, 0).astype(np.int64), np.where(inside, x, 0).astype(np.int64)
     return np.where(inside, disparity[at], np.nan), np.where(inside, sure[at], 0)

@@ -44,7 +44,10 @@ def require_final(device: Device, *verbs: Callable[[], object]) -> None:
 
 @dataclass(frozen=True)
 class SpadCase:
-    """A SPAD array, open, and a request it can fulfil for a few thousand frames; small enough to be quick."""
+    """A SPAD array that is open, and a request that it can fulfil for a few thousand frames.
+
+    Frames should be small, so that the suite is quick.
+    """
 
     device: SpadArray
     request: SpadRequest

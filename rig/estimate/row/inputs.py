@@ -49,7 +49,10 @@ TABLE = logit_table()
 
 
 class Sweep(NamedTuple):
-    """Geometry of a sweep, as in SweepGeometry. w_near, w_far: inverse depths. others: (columns, lines - 1, 3)."""
+    """Geometry of a sweep for kernels; fields as in `SweepGeometry`.
+
+    w_near, w_far: inverse depths of the ends of the depth range. others: (columns, 0, 3) if there is one line.
+    """
 
     window: int
     x0: Int32

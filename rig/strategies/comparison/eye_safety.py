@@ -148,6 +148,6 @@ class Field:
         return beam, beam
 
     def flash(self, pulse_s: float, rate_hz: float) -> tuple[Beam, Beam]:
-        """Short pulses over the whole field."""
+        """Beam of short pulses that light the whole field."""
         beam = Beam(self.of_picture * self.power_w / (pulse_s * rate_hz), pulse_s, rate_hz)
         return beam, beam

@@ -170,8 +170,10 @@ def mark_rows(place: Int16, hot: Bools, side: int, tables: LabelTables) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def middle_row(place: Int16, c: int, rows: tuple[int, int], variant: int) -> tuple[int, int, int]:
-    """The row of a variant (-1: of any) nearest the middle of `rows`, -1 if there is none; the first position of all
-    rows of the variant, and the one after the last. Positions are two per pixel, from the pixel that holds label 0 on.
+    """Find the rows of a variant (-1: of any) among `rows`, (first, last + 1).
+
+    Returns the row nearest to the middle, -1 if there is none; and of all these rows together, the first position and
+    the last one plus 1. There are two positions per pixel, counted from the pixel with label 0.
     """
     middle = (rows[0] + rows[1]) // 2
     best, first, end = -1, 1 << 15, 0
