@@ -33,8 +33,8 @@ class KindConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """The things that a device needs besides its config. Real devices use clock, ports and tap, simulated ones clock,
-    world and seed.
+    """The things that a device needs besides its config. Real devices use clock, ports and tap; simulated devices use
+    clock, world and seed.
     """
 
     clock: Clock

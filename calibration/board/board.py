@@ -108,7 +108,7 @@ class Board:
 
     @property
     def corners_m(self) -> Array:
-        """(n, 3) float64, inner corners in the order of their ids; z = 0."""
+        """The inner corners in the order of their ids, float64 (n, 3); z = 0."""
         across, down = self.grid
         y, x = np.mgrid[1 : down + 1, 1 : across + 1] * self.square_m
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)

@@ -268,9 +268,10 @@ def board_points(camera: Camera, sightings: Sequence[Sighting], poses: Sequence[
 
 
 def first_scanner(points: LitPoints, command_range: tuple[float, float]) -> tuple[PivotScanner, Array]:
-    """Start values of a fit: a mirror and (lag forward, lag backward, 0), lags within 0 and MOST_FIRST_LAG_S.
+    """Start values of a fit: a mirror and (lag forward, lag backward, 0).
 
-    Lags that the sweeps cannot separate get one value; if the sweeps determine neither, both are 0.
+    Lags are between 0 and MOST_FIRST_LAG_S. Lags that the sweeps cannot separate get one value; if the sweeps determine
+    neither, both are 0.
     """
     # The signed speeds at which enough boards were scanned for planes; if there are none, those with most boards.
     velocities = np.unique(points.velocity_per_s)

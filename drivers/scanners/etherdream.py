@@ -150,7 +150,7 @@ class EtherDreamDac:
         return self._stream
 
     def hold(self, stream: PointStream, command: float) -> None:
-        """Begin to hold the mirror at `command`, where it rests, by a thread."""
+        """Start a thread that holds the mirror at `command`, the position at which it rests."""
         self._letting_go = threading.Event()  # a new one: it is never cleared for a thread that is about to end
         run = (stream, command, self._letting_go)
         self._holder = threading.Thread(target=self._hold, args=run, name=f"{self.name} hold", daemon=True)

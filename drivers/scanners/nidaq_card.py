@@ -196,7 +196,8 @@ class NiCard:
     def tune(self, task: Any, rate_hz: Fraction, source: str = "", samples: int = 1000) -> Fraction:
         """Set up a task to run until it is stopped, with this sample clock. Returns the exact rate.
 
-        source: terminal of a clock at this rate; "" is the card's own, whose rate is read back. samples: of the buffer.
+        source: terminal of a clock at this rate; "" is the card's own clock, whose rate is read back. samples: size of
+        the buffer.
         """
         timing, continuous = task.timing, self.const.AcquisitionType.CONTINUOUS
         timing.cfg_samp_clk_timing(float(rate_hz), source=source, sample_mode=continuous, samps_per_chan=samples)

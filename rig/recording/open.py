@@ -41,7 +41,7 @@ def open_recording(folder: Path) -> RunRecording:
 def require_recording(path: Path, wanted: str = "a run taken with `record`") -> None:
     """Raise UsageError if a path is no folder with a recording, or zstandard is missing for a compressed one.
 
-    wanted: whose folder the message asks for.
+    wanted: description of such a folder, for the message.
     """
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:

@@ -153,7 +153,7 @@ def echoes(setting: Setting, rows: NDArray[np.int64], steady_per_s: Array, multi
 
 
 def solid_angle_sr(setting: Setting) -> float:
-    """Solid angle of the picture."""
+    """Solid angle of the picture, in sr."""
     u, v = setting.view.u, setting.view.v
     (u_y, u_x), (v_y, v_x) = np.gradient(u), np.gradient(v)
     return float(np.nansum(np.abs(u_x * v_y - u_y * v_x) / (u * u + v * v + 1) ** 1.5))

@@ -224,7 +224,7 @@ class Transport:
         """Detections of the pixels in the row of each spot, (n, width), per second and per watt in the whole column.
 
         A spot is the part of column columns[i] in row rows[i], an index into the measured rows. It is seen in its own
-        row only. moment: with its drops and flakes."""
+        row only. moment: drops and flakes whose light is added, or None."""
         found = self.spot_light[rows, columns]
         if moment is not None:
             for i, at in enumerate(zip(columns.tolist(), rows.tolist(), strict=True)):

@@ -44,7 +44,7 @@ class Score:
 
 
 def scored_pixels(truth: SweepTruth, geometry: ColumnGeometry) -> Bools:
-    """Pixels (rows, width) of the measured rows that are scored. truth: of all rows, for the geometry's columns."""
+    """Which pixels of the measured rows are scored, (rows, width). truth: of all rows, for the geometry's columns."""
     depth_m, stripes = truth.depth_m[geometry.rows], truth.x_px[geometry.rows]
     near_m, far_m = geometry.depth_range_m
     with np.errstate(invalid="ignore"):
@@ -61,7 +61,7 @@ def scored_pixels(truth: SweepTruth, geometry: ColumnGeometry) -> Bools:
 
 
 def score(answer: Answer, truth: SweepTruth, geometry: ColumnGeometry, scored: Bools) -> Score:
-    """Score an answer. scored: from `scored_pixels`, at least one pixel, else ValueError."""
+    """Score an answer. scored: from `scored_pixels`. Raises ValueError if no pixel is scored."""
     if not scored.any():
         raise ValueError("no pixel can be scored: the source lights nothing that the camera sees and knows")
     true_m = truth.depth_m[geometry.rows][scored].astype(np.float64)
