@@ -1,5 +1,7 @@
 """The second view against the geometry of planes, and both views' light against the effects of ambient light."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,15 @@ def test_what_only_the_second_camera_would_see_is_filled_with_the_farther_neighb
     for of_row in columns:
         assert len(of_row) == pytest.approx(10, abs=1)
         assert of_row.mean() == pytest.approx(54.5 + 22, abs=1)
+
+
+def test_the_second_camera_is_level_with_the_first_wherever_the_source_is() -> None:
+    model = rig()
+    assert model.source_m is not None
+    high = replace(model, source_m=model.source_m + np.array([0.0, 0.05, 0.02]))
+    level, other = (second_view(painted(each, wall(each, (0.2, 0.1, 0.97), 4.0)).view, ROWS) for each in (model, high))
+    np.testing.assert_array_equal(level.range_m, other.range_m)
+    np.testing.assert_array_equal(level.albedo, other.albedo)
 
 
 def test_open_sky_is_empty_and_only_airlight() -> None:
