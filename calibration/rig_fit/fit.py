@@ -290,8 +290,8 @@ def fit_rig(
     variance of 0 are known exactly and not fitted.
     start: its mirror and times are the start values of the fit, unless it holds a table of planes. What is not fitted
     is kept, such as source and defects; its command range grows if passages lie outside.
-    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError for the camera of
-    another sensor or of a tilted one.
+    Raises Degenerate, with the reason, if the views do not determine a model, and CalibrationError if the camera's
+    sensor has another size or is tilted.
     """
     shown = rig_state.usable(views)
     if not shown:

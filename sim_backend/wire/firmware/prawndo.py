@@ -120,8 +120,8 @@ class PrawnDoModel(OutputLevels):
     # The wire
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Take bytes from the host; returns what was said unasked before, then the answers to all lines and words of
-        `adm` that are complete.
+        """Take bytes from the host and return the board's bytes: first messages that were due before, then the answers
+        to all complete lines, and to complete words of `adm`.
         """
         answer = self.tick(now_s)
         while data:
