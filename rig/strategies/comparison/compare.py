@@ -290,7 +290,7 @@ class Reached:
         self._all += np.bincount(self._bin, minlength=len(self._all))
 
     def range_m(self) -> float | None:
-        """The farthest depth of the farthest bin in which at least REACHED of the answers were good; None if none."""
+        """Largest depth in the farthest bin of which at least the share REACHED is good; None if there is none."""
         counts = np.bincount(self._bin, minlength=len(self._all)) >= FEWEST
         far = np.flatnonzero(counts & (self._good >= REACHED * np.maximum(self._all, 1)))
         return float(self._true_m[self._bin == far[-1]].max()) if len(far) else None
