@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.files.rig_file import load_rig_model
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings, lookup
 from rig.plan.scan_plan import column_command
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.comparison.places import RAMP, scene_file
 from rig.strategies.comparison.score import scored_pixels
 from rig.strategies.strategy import Answer, ColumnGeometry, Strategy, TooShort, find_strategy, strategy_names
 from tests.system.small_rig import calibration
@@ -26,12 +24,14 @@ ROWS, WIDTH, COLUMNS = 24, 160, 160
 COMMANDS = (-0.8, 0.8)
 RANGE_M = (2.0, 15.0)
 """Narrow enough that the windows of eight lines do not overlap: docs/explanation/multi-line.md."""
+NEAR_M, FAR_M = 2.1, 12.0
+"""Ends of the wall, within the range: what lies nearer would be taken for another line's stripe."""
 POWER_W = 0.05
 LONG_S = 0.5
 """Plenty of time for all, even for the line before the conventional camera."""
 SURE, MOST_WRONG = 0.9, 0.01
 """Confidence of a claim, and share of such claims that noise may cause in the dark: hot pixels and dark counts."""
-MORE_WRONG = {"likelihood": 0.05}
+MORE_WRONG = {"likelihood": 0.12}
 """The same for an estimator that looks at one row at a time and has learned from darkness alone, by end of name."""
 
 
@@ -42,7 +42,16 @@ def world(folder: str, lux: float) -> Any:
     rig["camera"]["distortion"] = [0.0] * 5
     geometry = Path(folder) / "rig.yaml"
     geometry.write_text(yaml.safe_dump(rig), encoding="utf-8")
-    scene = scene_file(RAMP, "clear", lux, load_rig_model(geometry), Path(folder))
+    surfaces = Path(folder) / "wall"
+    if not surfaces.exists():
+        surfaces.mkdir()
+        depth_m = np.broadcast_to(1 / np.linspace(1 / NEAR_M, 1 / FAR_M, WIDTH), (ROWS, WIDTH))
+        patches = (
+            np.random.default_rng(1).uniform(0.2, 0.8, (ROWS // 4, WIDTH // 4)).repeat(4, axis=0).repeat(4, axis=1)
+        )
+        np.savez(surfaces / "world.npz", depth_m=depth_m.astype(np.float32), albedo=patches.astype(np.float32))
+    scene = Path(folder) / f"scene-{lux:g}.yaml"
+    scene.write_text(yaml.safe_dump({"surfaces": str(surfaces), "ambient": {"illuminance": f"{lux:g} lux"}}))
     kind = lookup("world", "simulated")
     config = kind.config.model_validate({"kind": "simulated", "geometry": str(geometry), "scene": str(scene)})
     return kind.create(config, Surroundings(VirtualClock(), None, seed=1))
@@ -112,8 +121,8 @@ def test_finds_a_clear_surface_as_well_as_it_says_and_the_same_again(strategy: S
         require_form(answer)
         found.append((answer, apparatus.spent))
     errors = bench.errors_px(found[0][0])
-    assert np.median(errors) <= strategy.clear_px
     assert errors.size >= 0.5 * np.count_nonzero(bench.scored)
+    assert np.median(errors) <= strategy.clear_px
     assert found[0][1].time_s <= LONG_S * (1 + 1e-9)
     assert found[0][1].energy_j <= POWER_W * LONG_S * (1 + 1e-6)
     np.testing.assert_array_equal(found[0][0].depth_m, found[1][0].depth_m)
