@@ -109,7 +109,10 @@ def corner_scale(corners: Corners) -> Array:
 
 
 def usable(views: Sequence[View]) -> list[View]:
-    """The views with enough corners for a pose, not all on one line; without corners whose position is not finite."""
+    """The views that have enough corners for a pose, not all of them on one line.
+
+    Corners whose position is not finite are left out first.
+    """
     found = []
     for view in views:
         if view.corners is None:

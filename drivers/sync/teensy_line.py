@@ -73,7 +73,7 @@ class TeensyLine:
     def ask(self, command: str, form: re.Pattern[str], tries: int = 1) -> re.Match[str]:
         """The answer to a command, without tag and checksum. tries: above 1 only for commands that may come twice.
 
-        Raises `DeviceTimeout` if none comes, `CommandRefused` for an error, `ProtocolError` if it has not the `form`.
+        Raises `DeviceTimeout` if none comes, `CommandRefused` for an error, `ProtocolError` if it lacks the `form`.
         """
         tag = b"#%08x " % (next(self._tags) & 0xFFFFFFFF)
         answer: str | None = None
@@ -96,7 +96,7 @@ class TeensyLine:
         raise ProtocolError(f"{self._name} answered {shown} with {answer[:40]!r}; check its firmware")
 
     def send(self, command: str) -> None:
-        """Send a command without a tag, and wait for no answer: that has no tag either, and is dropped."""
+        """Send a command without a tag, and do not wait for the answer. It has no tag either, and is dropped later."""
         self._write(command.encode("ascii", "replace"))
 
     def status(self) -> SyncStatus:

@@ -113,8 +113,8 @@ class StatisticalLimit:
     mean_abs_px, mean_abs_se_px: smallest mean |error| of any answer from one row, or from `averaged` equal ones, and
     its standard error.
     within_1px: share of those answers within 1 px.
-    exponent: median over rows of the smallest Chernoff exponent per exposure to a position more than 1 px off, of one
-      row whatever `averaged`.
+    exponent: median over rows of the smallest Chernoff exponent per exposure to a position more than 1 px off. It is
+      that of a single row, whatever `averaged` is.
     position_sd_px: median Cramer-Rao bound, of `averaged` rows together.
     """
 

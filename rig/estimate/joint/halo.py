@@ -130,7 +130,10 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x, by coordinate descent. Only x[free] may be negative; -1: none."""
+    """The x that minimises x' matrix x - 2 right' x, by coordinate descent.
+
+    free: index of the only x that may be negative; -1 if none may.
+    """
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
         largest = 0.0
