@@ -6,6 +6,7 @@ simulated apparatus is `sim_backend.projector`. Every apparatus adds up the time
 `rig.strategies.comparison` compares the time with the budget.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -27,6 +28,10 @@ class Budget:
     """Limit of a measurement. time_s: from the beginning of the first exposure to the end of the last one."""
 
     time_s: float
+
+    def frames(self, frame_s: float) -> int:
+        """Number of whole frames in the time, also if it is too short by a millionth of a frame because of rounding."""
+        return math.floor(self.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 
 class Apparatus(Protocol):

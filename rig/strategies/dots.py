@@ -57,11 +57,11 @@ class Dots:
         saturate, several are added. rng_seed: of the pattern.
         """
         frame_s = apparatus.spad_frame_s if self.camera == "spad" else apparatus.camera_frame_s
-        if budget.time_s < frame_s * (1 - 1e-9):
+        frames = budget.frames(frame_s)
+        if frames < 1:
             raise TooShort(f"{self.name} needs {frame_s:g} s for one exposure")
         shown = dot_pattern(int(apparatus.rows[-1]) + 1, apparatus.columns, rng_seed)[apparatus.rows]
         if self.camera == "spad":
-            frames = int(budget.time_s / frame_s * (1 + 1e-9))
             counts = apparatus.spad_counts(shown[None], np.array([frames]))[0]
             # Detections that frames of one bit have hidden are put back; a pixel that always fired had more than these.
             share = np.minimum(counts, frames - 0.5) / frames

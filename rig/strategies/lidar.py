@@ -61,7 +61,7 @@ class FlashLidar:
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
         """See `Strategy`. All of the time is used for pulses, one in each frame of the SPAD."""
-        pulses = int(budget.time_s / apparatus.spad_frame_s * (1 + 1e-9))
+        pulses = budget.frames(apparatus.spad_frame_s)
         if pulses < 1:
             raise TooShort(f"{self.name} needs {apparatus.spad_frame_s:g} s for one pulse")
         sigma_s = apparatus.pulse_sigma_s

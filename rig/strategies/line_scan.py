@@ -40,11 +40,6 @@ MIN_CONFIDENCE: Final = 0.5
 """Answers with a lower confidence do not enter a depth map, as in a scan."""
 
 
-def frames_within(budget: Budget, frame_s: float) -> int:
-    """Number of whole frames within a budget, also if it is too short by a millionth of a frame because of rounding."""
-    return math.floor(budget.time_s / frame_s * (1 + 1e-9) + 1e-6)
-
-
 def shares(frames: int, places: int) -> NDArray[np.int64]:
     """Number of frames at each place, (places,). They add up to `frames` and differ by one at most."""
     result: NDArray[np.int64] = np.diff(np.arange(places + 1) * frames // places)
@@ -110,7 +105,7 @@ class LineScan:
                 f"{geometry.columns} columns are no multiple of {self.lines} lines; give the apparatus "
                 f"{geometry.columns // self.lines * self.lines} columns"
             )
-        frames = frames_within(budget, apparatus.spad_frame_s)
+        frames = budget.frames(apparatus.spad_frame_s)
         dark = max(1, math.ceil(MIN_DARK_FRACTION * frames))
         across = geometry.columns // self.lines
         if frames - dark < min(LEAST_PLACES, across):
@@ -180,7 +175,7 @@ class LineCamera:
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
         """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time."""
-        most = frames_within(budget, apparatus.camera_frame_s)
+        most = budget.frames(apparatus.camera_frame_s)
         if most < LEAST_PLACES:
             raise TooShort(f"{self.name} needs {LEAST_PLACES * apparatus.camera_frame_s * 1e3:.3g} ms")
         number = min(geometry.columns, most)

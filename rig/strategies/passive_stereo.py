@@ -94,7 +94,7 @@ class PassiveStereo:
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
         """See `Strategy`. Both cameras expose at the same time. Nothing is random here."""
         frame_s = apparatus.camera_frame_s
-        if budget.time_s < frame_s * (1 - 1e-9):
+        if budget.frames(frame_s) < 1:
             raise TooShort(f"{self.name} needs {frame_s:g} s for one exposure")
         pair = exposed(
             lambda number, exposure_s: np.stack([apparatus.stereo_pair(exposure_s) for _ in range(number)]),

@@ -28,7 +28,7 @@ from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
 from rig.simd import Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.line_scan import MIN_CONFIDENCE, frames_within, windowed
+from rig.strategies.line_scan import MIN_CONFIDENCE, windowed
 from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
 
 COARSEST: Final = 16
@@ -89,10 +89,11 @@ class PointScan:
         """Measure once (see `Strategy`)."""
         share = geometry.shape[0] / geometry.model.camera.height
         tried = (len(BRIGHTNESS) + 1) * TRIED
-        frames = math.floor((frames_within(budget, apparatus.spad_frame_s) - tried) * share)
+        frames = math.floor((budget.frames(apparatus.spad_frame_s) - tried) * share)
         grid = grid_within(frames, (geometry.shape[0], geometry.columns)) if frames > 0 else None
         if grid is None:
-            spots = geometry.shape[0] * geometry.columns / COARSEST**2 / share + tried
+            rows, columns = (-(-n // COARSEST) for n in (geometry.shape[0], geometry.columns))
+            spots = rows * columns / share + tried
             raise TooShort(f"{self.name} needs {spots * apparatus.spad_frame_s * 1e3:.3g} ms")
         brightness = choose_brightness(apparatus, geometry, np.random.default_rng(rng_seed))
         thinned = ColumnGeometry(

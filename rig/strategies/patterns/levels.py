@@ -58,7 +58,7 @@ def spad_frames(apparatus: Apparatus, budget: Budget, weights: Sequence[float]) 
     Raises `TooShort` if the budget has fewer frames than there are patterns.
     """
     share = np.asarray(weights, np.float64)
-    total = int(budget.time_s / apparatus.spad_frame_s * (1 + ROUNDING))
+    total = budget.frames(apparatus.spad_frame_s)
     if total < len(share):
         needed_s = len(share) * apparatus.spad_frame_s
         raise TooShort(f"{len(share)} patterns take {needed_s:.3g} s, the budget is {budget.time_s:.3g} s")

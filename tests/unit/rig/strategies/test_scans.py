@@ -15,7 +15,6 @@ from rig.strategies.line_scan import (
     LineCamera,
     LinePlaces,
     LineScan,
-    frames_within,
     peak_centroids,
     places_of,
     shares,
@@ -32,12 +31,12 @@ from rig.strategies.point_scan import (
     tail,
 )
 from rig.strategies.point_scan import LIKELIHOOD as POINT_LIKELIHOOD
-from rig.strategies.strategy import TooShort
+from rig.strategies.strategy import ColumnGeometry, TooShort
 from tests.stability.inventory import covers
 from tests.unit.rig.strategies.plain_scene import COLUMNS, HEIGHT, PlainScene, plain_geometry
 
 covers(
-    frames_within,
+    Budget,
     places_of,
     shares,
     windowed,
@@ -120,6 +119,16 @@ def test_too_short_is_said_before_any_light():
         assert scene.spent.time_s == 0
 
 
+def test_the_time_that_a_point_scan_says_it_needs_is_enough_also_for_few_rows():
+    few = ColumnGeometry(GEOMETRY.model, GEOMETRY.commands, GEOMETRY.depth_range_m, np.arange(3))
+    with pytest.raises(TooShort) as short:
+        FIRST_BRIGHT.measure(PlainScene(few), few, Budget(1e-4), 0)
+    needs_s = 1e-3 * float(str(short.value).split()[-2])
+    FIRST_BRIGHT.measure(PlainScene(few), few, Budget(1.01 * needs_s), 0)
+    with pytest.raises(TooShort):
+        FIRST_BRIGHT.measure(PlainScene(few), few, Budget(0.98 * needs_s), 0)
+
+
 def test_columns_must_be_a_multiple_of_the_lines():
     odd = plain_geometry(columns=COLUMNS - 2)
     with pytest.raises(ValueError, match="multiple of 4 lines"):
@@ -133,7 +142,7 @@ def test_places_share_columns_evenly():
         np.testing.assert_array_equal(places.patterns().sum(axis=0), 1)
         np.testing.assert_allclose(places.commands, [np.flatnonzero(p).mean() for p in places.patterns()])
     assert places.number == COLUMNS
-    assert frames_within(Budget(0.05), 1e-5) == 5000  # 0.05 / 1e-5 rounds to 5000.000000000001 or 4999.999
+    assert Budget(0.05).frames(1e-5) == 5000  # 0.05 / 1e-5 rounds to 5000.000000000001 or 4999.999
 
 
 def test_no_frame_is_left_over():
