@@ -9,8 +9,8 @@ class DeviceError(Exception):
 
 
 class DeviceNotFound(DeviceError):
-    """Raised when a device to be opened is not attached or does not answer as its kind does, when its address is no
-    usable one, or when a recording cannot be found or read.
+    """Raised when a device to be opened is not attached or does not answer as its kind does, when its address cannot be
+    used, or when a recording cannot be found or read.
     """
 
 

@@ -98,7 +98,7 @@ class PivotScanner:
     first.
     cone_rad: constant tilt of the normal towards the axis; the planes then touch a cone whose tip is axis_point_m.
     bow_per_rad: bending of the sheet out of its plane by bow x (angle within the fan)^2, along n(a); see `light_sheet`.
-    Raises CalibrationError for numbers that are no such mirror.
+    Raises CalibrationError for numbers that describe no such mirror.
     """
 
     axis_point_m: Array

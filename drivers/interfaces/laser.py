@@ -72,7 +72,7 @@ class LineLaser(Device):
         self, on_silence: Callable[[DeviceError], object] | None, overloaded: Callable[[], bool] = lambda: False
     ) -> None:
         """Have `on_silence` called, on any thread, as soon as the laser answers a question later than it ever should
-        and says nothing when asked once more. None: no longer. The guard does this while the laser is armed. Does
+        and says nothing when asked once more. None ends this. The guard does this while the laser is armed. Does
         nothing for a laser that cannot be asked.
 
         overloaded: whether this host has so much to do now that it may hold up an answer.

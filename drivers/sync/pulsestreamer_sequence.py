@@ -36,9 +36,9 @@ _CLOCK_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class GateSequence:
-    """Steps that the box plays after each wait. steps: `STEP` (n,). sweeps: number of times.
+    """Steps that the box plays again and again. steps: `STEP` (n,). sweeps: how often they are played.
 
-    waits: whether it waits for the scan marker before each; rest: levels of the channels meanwhile.
+    waits: whether the box waits for the scan marker each time before. rest: levels of the channels meanwhile.
     """
 
     steps: NDArray[np.void]

@@ -10,13 +10,13 @@ Point and partners each have a line of counts: those of the row in the column.
 - Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
-- Answers of estimators that learn the light: an answer with confidence 0.9, for one place of some 150, needs evidence
-  of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on
-  average, which is light half a standard deviation above the background. That much more light must be at the answers
-  than behind them, on lines of counts that did not give the answers; or, in dense fog, where more lines contribute, at
-  least 0.4 of the light that the estimator says it has found.
+- Answers of estimators that learn the light. An answer is one of some 150 places, so a confidence of 0.9 needs evidence
+  of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on average,
+  which is light half a standard deviation above the background. The light at the answers must exceed the light behind
+  them by this much, on lines of counts that did not give the answers. In dense fog more lines contribute. There it is
+  enough if it exceeds it by 0.4 of the light that the estimator says it has found.
 
-Answers that do not have that much light lose their confidence, and with them all answers at the same distances.
+If the light does not suffice, the answers lose their confidence, and with them all answers at the same distances.
 
 Standard deviations are estimated from the points themselves. With too few points, a check says nothing.
 """

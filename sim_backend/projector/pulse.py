@@ -261,8 +261,10 @@ def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, 
 
 @numba.njit(cache=True, nogil=True)
 def time_first(rng: np.random.Generator, pulses: int, mean: Array, counts: NDArray[np.uint32]) -> None:
-    """Draw the number of first photons in each bin. pulses: their number. mean: detections of a pulse in each bin, on
-    average, (bins,). counts: the result, (bins,)."""
+    """Draw the number of first photons in each bin, after a number of `pulses`, and write it into `counts` (bins,).
+
+    mean: average detections of a pulse in each bin, (bins,).
+    """
     left, wait = pulses, next_wait(rng)
     for i in range(len(mean)):
         found, wait = count(rng, wait, left, mean[i])

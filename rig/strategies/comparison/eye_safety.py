@@ -15,13 +15,13 @@ duration in s.
     class 3B            0.03 J               t < 0.06 s
                         0.5 W                above
 
-Time bases: 100 s for class 1, 0.25 s for the others. Pulses must meet three rules: each one its own limit; all of them
-within the time base the limit of that time; and each one its limit times C5, where C5 = 5 N^-0.25 (at least 0.4) if N >
-600 pulses of at most 5 us fall into a time base above 0.25 s, and 1 otherwise. Pulses closer than 5 us count as one of
-5 us. The limits for heat are the exposure limits of ICNIRP ("Guidelines on limits of exposure to laser radiation of
-wavelengths between 180 nm and 1,000 um", Health Physics 105, 2013) times the pupil's area: 18 t^0.75 J/m2, 2e-3 J/m2
-and 10 W/m2. This is arithmetic for comparing sources, no classification of a product; see
-docs/explanation/laser-safety.md.
+Time bases: 100 s for class 1, 0.25 s for the others. Pulses must meet three rules. Each pulse must keep the limit for
+its own duration. All pulses within the time base together must keep the limit for that time. And each pulse must keep
+its limit times C5, where C5 = 5 N^-0.25 (at least 0.4) if N > 600 pulses of at most 5 us fall into a time base above
+0.25 s, and 1 otherwise. Pulses closer than 5 us count as one of 5 us. The limits for heat are the exposure limits of
+ICNIRP ("Guidelines on limits of exposure to laser radiation of wavelengths between 180 nm and 1,000 um", Health Physics
+105, 2013) times the pupil's area: 18 t^0.75 J/m2, 2e-3 J/m2 and 10 W/m2. This is arithmetic for comparing sources, no
+classification of a product; see docs/explanation/laser-safety.md.
 """
 
 import math
