@@ -117,7 +117,7 @@ class OnlineLearner(Generic[Tables]):
         return self.model if self.model is not None else first()
 
     def certain(self, frames: int) -> bool:
-        """Whether there is a model that cannot change until so many lit frames have been attended to."""
+        """Whether there is a model that will not change during the next `frames` lit frames."""
         if self.model is None or frames == 0 or not self._learns:
             return self.model is not None
         # A lesson could begin with the first of these maps.

@@ -115,7 +115,10 @@ LEAST_LEFT: Final = np.float32(1e-5)
 
 
 def log_bayes_factor(left: Float32, independent: float) -> Float32:
-    """Logarithm of the Bayes factor B of the module's docstring. left: 1 - r^2, 0 to 1. n: of independent values."""
+    """Logarithm of the Bayes factor B of the module's docstring.
+
+    left: 1 - r^2, 0 to 1. n: number of independent values in a block.
+    """
     n = max(independent, 3.0)
     return np.asarray(0.5 * (n - 2) * np.log1p(n) - 0.5 * (n - 1) * np.log1p(n * left), np.float32)
 

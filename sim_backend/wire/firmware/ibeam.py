@@ -142,7 +142,7 @@ class IbeamModel:
         self._tell()
 
     def power_up(self, now_s: float) -> None:
-        """Take the supply away and give it back: the laser is off, `ext` too, and it talks to people again."""
+        """Switch the supply off and on. Laser and `ext` are off then, and echo and prompt are on."""
         self._now_s = now_s
         self._pending = self._late = ""
         self._last_s = float("-inf")
