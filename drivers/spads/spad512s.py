@@ -12,7 +12,7 @@ Facts and their sources: docs/reference/devices/spad512s.md. `spad512s_line` tal
 - Frames lie on their side: the vendor's samples turn them by 90 degrees counter-clockwise (`rotation`).
 - Frames carry neither ticks nor markers; the ticks in the records are nominal. Frames have no number or checksum
   either. Pixels handed over twice would have the right length, so a frame identical to an earlier one of the run is an
-  error, unless chance can do that: dark frames often differ in nothing (`OWN_ONES`).
+  error, unless it can be by chance: dark frames are often identical (`OWN_ONES`).
 - `STOP` is known only from other people's code. If a run does not end soon after it, the connection is closed.
 """
 

@@ -174,9 +174,10 @@ def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[floa
 
 
 def uncalibrated_geometry(rows: int, width: int, columns: int) -> SweepGeometry:
-    """Geometry of a rig without a model: the whole row is searched, near points are assumed left, depth means nothing.
+    """Geometry of a rig without a model. The whole row is searched, and near points are assumed to lie on the left.
 
-    Inverse depth falls linearly from 1.5 to 0.5 across the picture, so that the estimators' haze profile has a scale.
+    Depth has no meaning. Inverse depth falls linearly from 1.5 to 0.5 across the picture, so that the estimators' haze
+    profile has a scale.
     """
     u = np.broadcast_to(np.linspace(-0.5, 0.5, width, dtype=np.float32), (rows, width)).copy()
     plane = np.tile(np.array([-1.0, 0.0, 1.0]), (columns, 1))

@@ -57,7 +57,7 @@ class HostReading(NamedTuple):
 
 
 def read_host() -> HostReading:
-    """UTC and the monotonic clock, the closest of a few readings."""
+    """UTC and the monotonic clock. Of a few readings it is that in which both were read closest together."""
     readings = []
     for _ in range(_READINGS):
         before = time.monotonic_ns()

@@ -203,7 +203,8 @@ class Run:
             raise
 
     def finish(self, summary: Summary, manifest: Mapping[str, Any]) -> RunResult:
-        """Write manifest and summary and make the folder appear. With neither map nor recorded block none is left."""
+        """Write manifest and summary and make the folder appear. If there is no map and no recorded block, no folder is
+        left."""
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:

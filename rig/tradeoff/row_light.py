@@ -66,7 +66,7 @@ class RowLight:
 
 
 def pixel_share(away_px: Array, sigma_px: float) -> Array:
-    """Share of a Gaussian line's light in pixels whose centres lie away_px from its own; exact in the flanks too."""
+    """Share of a Gaussian line's light in pixels whose centres lie away_px from the line's; exact in its flanks too."""
     away = np.abs(away_px)
     shares = np.zeros(away.shape)
     near = away < PROFILE_SIGMAS * sigma_px + 0.5

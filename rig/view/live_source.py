@@ -89,7 +89,7 @@ class LiveSource:
 
     @property
     def newest_row(self) -> object:
-        """Another object whenever counts of a row have come."""
+        """The counts of the row that was asked for; a new object each time new counts have come."""
         return self._row
 
     def stop(self) -> bool:

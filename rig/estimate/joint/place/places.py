@@ -73,7 +73,10 @@ class Places(NamedTuple):
 
 @numba.njit(inline="always")
 def most_shown(frames):  # type: ignore[no-untyped-def]
-    """Largest flux that so many frames measure well: DARK_FRAMES of them stay dark. FEW_FRAMES_FLUX for few frames."""
+    """Largest flux that a number of frames measure well: that with which DARK_FRAMES of them stay dark.
+
+    For few frames it is FEW_FRAMES_FLUX.
+    """
     return np.log(frames / DARK_FRAMES) if frames > FEW_FRAMES else FEW_FRAMES_FLUX
 
 
