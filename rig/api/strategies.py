@@ -13,7 +13,7 @@ from rig.run_folder.folder import RunFolder
 from rig.strategies.apparatus import Rule
 from rig.strategies.comparison.compare import LINES, Comparison, ComparisonPlan, run_comparison
 from rig.strategies.comparison.files import write_files
-from rig.strategies.comparison.places import air_problems
+from rig.strategies.comparison.places import OWN, air_problems
 from rig.strategies.strategy import find_strategy, strategy_names
 
 ALL: Final = "all"
@@ -71,7 +71,8 @@ def compare_strategies(
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
     scenes = _once(request.scenes) or SCENES
-    asked = ComparisonPlan(scenes, airs, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
+    own = tuple(None if air == OWN else air for air in airs)
+    asked = ComparisonPlan(scenes, own, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
     with RunFolder(request.out) as folder:

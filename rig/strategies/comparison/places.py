@@ -1,8 +1,9 @@
 """Scenes in different air, as files that a simulated world reads: fog of a visibility, rain, snow, or clear air.
 
 A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall with random texture that recedes from
-1.2 to 14 m, so that every distance is there. The air that is asked for replaces fog, rain and snow of the scene.
-Ambient light is that of the scene; a scene without any gets that of the bundled scenes.
+1.2 to 14 m, so that every distance is there. The air that is asked for replaces fog, rain and snow of the scene. Fog of
+a visibility is always one of droplets that scatter light more than once, whatever the scene has in its own. Ambient
+light is that of the scene; a scene without any gets that of the bundled scenes.
 """
 
 from pathlib import Path
@@ -20,6 +21,8 @@ from rig.config.models import RigConfig
 from rig.errors import UsageError
 
 CLEAR: Final = "clear"
+OWN: Final = "own"
+"""Word for the air of the scene itself."""
 WEATHER: Final[dict[str, dict[str, Any]]] = {
     "rain": {"rain": {"rate": "20 mm/h", "wind": "1 m/s"}},
     "snow": {"snow": {"rate": "2 mm/h", "wind": "0.5 m/s"}},
@@ -38,14 +41,16 @@ def air_problems(airs: "list[str] | tuple[str, ...]") -> list[str]:
     """A line for each name that is not an air, saying why."""
     problems = []
     for air in airs:
-        if air == CLEAR or air in WEATHER:
+        if air in (CLEAR, OWN) or air in WEATHER:
             continue
         try:
             visible = parse_quantity(air, "length") > 0
         except ValueError:
             visible = False
         if not visible:
-            problems.append(f"fog {air!r} is no air; write a visibility such as 20m, or {CLEAR}, {', '.join(WEATHER)}")
+            problems.append(
+                f"fog {air!r} is no air; write a visibility such as 20m, or {CLEAR}, {', '.join(WEATHER)} or {OWN}"
+            )
     return problems
 
 

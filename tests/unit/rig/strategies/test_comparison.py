@@ -99,6 +99,14 @@ def test_the_same_seed_gives_the_same_figures(config, done):
     assert [replace(row, compute_s=0.0) for row in again.rows] == [replace(row, compute_s=0.0) for row in expected]
 
 
+def test_own_air_is_that_of_the_scene(config):
+    asked = {**SOME, "rules": ["energy"], "strategies": ["gray-spad"], "times": ["20ms"]}
+    own, clear = (compare_strategies(config, **asked | {"scenes": ["street"], "fogs": [air]}).rows[0]
+                  for air in ("own", "clear"))  # fmt: skip
+    assert (own.air, clear.air) == (None, "clear")
+    assert own.good < clear.good  # the street's own is foggy
+
+
 def test_several_seeds_give_a_spread(config):
     found = compare_strategies(
         config,
@@ -227,7 +235,7 @@ def test_air_replaces_what_the_scene_has(tmp_path, config):
     }  # fmt: skip
     assert "rain" in read("street-dense-fog", "rain", None)
     assert "medium" in read("street-dense-fog", None, None)
-    assert air_problems(["clear", "rain", "snow", "20 m"]) == []
+    assert air_problems(["clear", "rain", "snow", "20 m", "own"]) == []
     assert (visibility_m("clear"), visibility_m("20m"), visibility_m("rain")) == (math.inf, 20.0, None)
 
 
