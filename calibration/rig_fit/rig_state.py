@@ -102,7 +102,7 @@ def sighting(view: View, board: Board, camera: Camera, pose: BoardPose) -> Sight
 
 
 def corner_scale(corners: Corners) -> Array:
-    """(n,) sd of each corner over the usual one, 1 if the picture gave none."""
+    """Standard deviation of each corner divided by the usual one, (n,); 1 if the picture gave none."""
     if corners.sd_px is None:
         return np.ones(len(corners.ids))
     return np.hypot(corners.likely_sd_px, LEAST_CORNER_SD_PX) / USUAL_CORNER_SD_PX

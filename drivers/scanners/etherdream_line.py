@@ -161,7 +161,7 @@ class EtherDreamLine:
         return Reply.read(self._exchange(command, _REPLY.size, within_s))
 
     def tell(self, command: bytes) -> Reply:
-        """Send one command and return its reply. Raises `CommandRefused` if it is not accepted, and as `ask`."""
+        """Send one command and return its reply. Raises `CommandRefused` if it is refused, and what `ask` raises."""
         reply = self.ask(command)
         if reply.code != ACCEPTED:
             raise CommandRefused(

@@ -121,7 +121,8 @@ class PointStream:
         return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
 
     def is_played(self, n: int) -> bool:
-        """Whether the first n points were played, by a last reply whose count was not one ahead."""
+        """Whether the first n points were played, by the board's last reply. A reply whose count is one ahead proves
+        nothing."""
         return self.played >= n and not self._ahead
 
     def send(self, points: PointSlice) -> None:

@@ -1,6 +1,6 @@
 """The call that makes one page of a run, of two runs side by side, of a calibration, or of a trade-off: `report`.
 
-Most reports are of runs, and their reader waits: what only the others need is imported when they are asked for.
+Most reports are of runs, and somebody waits for them. So modules that only other reports need are imported late.
 """
 
 from dataclasses import dataclass

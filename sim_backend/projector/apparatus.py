@@ -204,8 +204,9 @@ class SimulatedApparatus:
     def stereo_pair(self, exposure_s: float) -> NDArray[np.uint16]:
         """Take one image with each of two conventional cameras, in ambient light only: uint16 (2, rows, width).
 
-        Both are without the narrow filter. The second one stands beside the first, as far as the light leaves the
-        mirror (see `sim_backend.projector.stereo`). Raises ValueError for an exposure shorter than `camera_frame_s`.
+        Both are without the narrow filter. The second one stands beside the first, as far left or right as the point
+        where light leaves the mirror (see `sim_backend.projector.stereo`). Raises ValueError for an exposure shorter
+        than `camera_frame_s`.
         """
         self._check_exposure(exposure_s)
         camera, setting = self._hardware.camera, self._setting

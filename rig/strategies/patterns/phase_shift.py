@@ -79,7 +79,7 @@ def shifted_sines(period: float, shifts: int, columns: int) -> Float32:
 def phase_of(levels: Levels) -> tuple[Float64, Float64, Float64]:
     """Phase in turns, 0 to 1, its standard deviation in turns, and the amplitude: (rows, width) each.
 
-    Without any contrast the phase is 0 and its standard deviation that of any phase, sqrt(1/12).
+    Without any contrast the phase is 0, and its standard deviation is that of a random phase, sqrt(1/12).
     """
     shifts = len(levels.light)
     theta = 2 * np.pi * np.arange(shifts)[:, None, None] / shifts

@@ -183,7 +183,7 @@ class EtherDreamModel:
             self._emergency_stop(LINK_LOST, now_s)
 
     def power_up(self, now_s: float) -> None:
-        """Take the supply away and give it back. The connection is not told."""
+        """Switch the supply off and on. The board forgets its client without closing the connection."""
         self.advance(now_s)
         self._stop(0, now_s)
         self._forget_client()

@@ -12,10 +12,10 @@ What drivers trip over:
 - Digital lines on `ao/SampleClock` miss what came before their start, and wait for ever for a clock that does not run.
 - A buffer is repeated unless that is forbidden. New samples for it come out after those in the card's memory: old and
   new ones mix.
-- Rates are 100 MHz by an integer; 48 kHz are 48007.68 Hz, and the crystal has an error of its own.
+- Rates are 100 MHz divided by an integer: for 48 kHz it is 48007.68 Hz. The crystal has an error of its own.
 - Two tasks cannot have the same output, nor can two have the clock of the analogue outputs.
 
-Public sources do not tell the following, and the model chose. A finite task is done half a period after its last
+Public sources do not tell the following, so it is assumed. A finite task is done half a period after its last
 sample. A stop drops samples that are not regenerated. A write to a task that waits for its trigger replaces samples
 that the card's memory already holds. A counter's first pulse begins with the edge number `initial_delay` of its
 clock after the start. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand
