@@ -181,7 +181,7 @@ class PartsRecording:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks that count, of all parts."""
+        """Number of blocks in all parts that are written and count (`WritesBlocks.blocks`)."""
         return sum(recording.blocks for recording in self._recordings)
 
     @property
