@@ -72,7 +72,7 @@ class Recording:
         self.folder = folder
         self.keep_blocks = 0
         self.blocks = 0
-        """Number of blocks that count."""
+        """Number of blocks that are written and count."""
         self.bytes = 0
         """Bytes that these blocks take in the segments, with padding."""
         self.busy_s = 0.0
@@ -293,7 +293,7 @@ class WritesBlocks(Protocol):
 
     @property
     def blocks(self) -> int:
-        """Number of blocks that count."""
+        """Number of blocks that are written and count."""
         ...
 
     @property

@@ -1,10 +1,11 @@
 """The scene from a second camera that stands beside the first, and what both cameras see of it.
 
-The second camera stands as far left or right as the light leaves the mirror, level with the first. It has the rays of
-the first, so from its place S it sees a point X in the direction X - S. The world has one depth per pixel of the first
-camera, and a tangent plane (facet). A pixel covers a strip of this plane in its row, and the strip covers an interval
-of the second picture. There the nearest of all strips is seen, with the albedo at that very place. Rows are assumed to
-be rectified: a point is in the same row of both pictures, which a lens that distorts shows only in the middle rows.
+The second camera stands to the left or right of the first, by as much as the point where the light leaves the mirror.
+It has the rays of the first, so from its place S it sees a point X in the direction X - S. The world has one depth per
+pixel of the first camera, and a tangent plane (facet). A pixel covers a strip of this plane in its row, and the strip
+covers an interval of the second picture. There the nearest of all strips is seen, with the albedo at that very place.
+Rows are assumed to be rectified: a point is in the same row of both pictures. With a lens that distorts this is true
+only in the middle rows.
 Some pixels of the second picture see places that are hidden from the first camera, so no strip covers them. They get
 the values of the nearest covered pixel to the left or to the right, of the two the one that is farther away from the
 camera. Computing time: 40 ms for 512 x 512 pixels.

@@ -17,7 +17,10 @@ ENDLESS = 10**9
 
 
 def gentle(case: ScannerCase) -> ScanWaveform:
-    """A raised cosine, seamless, at a third of the first limit it meets, at a clock in the middle of its range."""
+    """A waveform without a jump at its ends: a raised cosine with a point rate in the middle of the scanner's range.
+
+    Its swing is a third of the largest that the scanner's limits allow.
+    """
     limits = case.device.limits
     slowest, fastest = limits.point_rate_hz
     clock = case.device.point_clock((slowest * fastest) ** 0.5)
