@@ -1,4 +1,4 @@
-"""The conformance suites of spadrig on the laser and the estimator of this package, and a scan with both."""
+"""The conformance suites of spadrig on laser and estimator of this package, a scan with both, and a comparison."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +9,7 @@ from foglab.centroid import Centroid
 from foglab.filtered_laser import FilteredLaser
 
 from drivers.clock import VirtualClock
-from rig.api import scan
+from rig.api import compare_strategies, scan
 from spadrig.conformance import EstimatorSuite, LaserCase, LineLaserSuite
 
 RIG = Path(__file__).parents[1] / "rig.yaml"
@@ -40,3 +40,12 @@ def test_a_scan_uses_both_by_their_names() -> None:
     assert np.isfinite(result.last.depth_m).mean() > 0.05
     truth = result.summary.truth
     assert truth is not None
+
+
+def test_the_ratio_finds_columns_in_clear_air_and_not_in_fog() -> None:
+    asked = {"scenes": ["ramp"], "fogs": ["clear", "20m"], "times": ["1 s"], "rules": ["energy"], "rows": 8}
+    clear, foggy = compare_strategies(strategies=["foglab-ratio"], **asked).rows
+    assert clear.median_px is not None
+    assert clear.median_px < 5
+    assert clear.good > 2 * foggy.good
+    assert clear.confident_wrong < 0.05
