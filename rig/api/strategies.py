@@ -80,7 +80,7 @@ def compare_strategies(
 
 
 def _once(given: Sequence[str]) -> tuple[str, ...]:
-    """What is given, in its order, without repetitions."""
+    """The given values in their order, without repetitions."""
     return tuple(dict.fromkeys(given))
 
 

@@ -47,7 +47,7 @@ goes up to 0.15 px)."""
 
 
 class Rectified(NamedTuple):
-    """How pictures of two cameras are rectified.
+    """Rectification of the pictures of two cameras.
 
     focal_baseline: b f in pixels times metres, positive if the second camera stands on the right of the first, else
     negative. maps: for `cv2.remap`, of both cameras; None if the pictures need no change. matrix: (3, 3) of the
@@ -60,7 +60,7 @@ class Rectified(NamedTuple):
 
 
 def rectified(model: RigModel) -> Rectified:
-    """How the pictures of a rig are rectified.
+    """Rectification of the pictures of a rig.
 
     Raises UsageError if the rig does not say where its source is, or if the source is not mainly beside the camera.
     """

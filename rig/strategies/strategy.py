@@ -85,7 +85,7 @@ class Strategy(Protocol):
 
 
 class ColumnGeometry:
-    """Where the light of each column lies, for the rows that are measured. Columns are fractional, centres at integers.
+    """Places of the light of each column, for the rows that are measured. Columns are fractional, centres at integers.
 
     For each pixel, the inverse depth is interpolated linearly between two columns. That is exact to 3e-5 of the depth
     for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.

@@ -44,7 +44,8 @@ class Score:
 
 
 def scored_pixels(truth: SweepTruth, geometry: ColumnGeometry) -> Bools:
-    """Which pixels of the measured rows are scored, (rows, width). truth: of all rows, for the geometry's columns."""
+    """Mask (rows, width) of the pixels that are scored, of the measured rows. truth: that of all rows, for the
+    geometry's columns."""
     depth_m, stripes = truth.depth_m[geometry.rows], truth.x_px[geometry.rows]
     near_m, far_m = geometry.depth_range_m
     with np.errstate(invalid="ignore"):

@@ -162,9 +162,9 @@ class BinaryCode:
         return shown, [1.0] * (len(code) - 1) + [longer, longer]
 
     def contrast(self, levels: Levels) -> tuple[Float64, Float64]:
-        """How far the light of each bit is above the middle between lit and dark, and the standard deviation of this.
+        """Light of each bit minus the middle between lit and dark, and its standard deviation.
 
-        Both are (bits, rows, width). Where the first is positive the bit is 1.
+        Both are (bits, rows, width). Where the first is positive, the bit is 1.
         """
         light, variance = levels.light, levels.variance
         if self.inverse:

@@ -246,7 +246,10 @@ class Decoder:
         return window.column(place), np.hypot(QUANTISED_SD, spread), right
 
     def likeliest(self, counts: NDArray[np.uint32], window: Window) -> tuple[Float64, Float64, Float64]:
-        """The same as `nearest`, by the likeliest words. These columns are fractional."""
+        """Columns, standard deviations and probabilities as in `nearest`, by the likeliest words.
+
+        The columns are fractional.
+        """
         evidence = window.of(self._evidence(counts))
         place = window.best(evidence)
         number = self._number(window, place)
