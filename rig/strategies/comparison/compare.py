@@ -211,7 +211,13 @@ def _of_place(
 
         def measure(way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, float, float]:
             apparatus = apparatus_of(rule, seed)
-            answer = way.measure(apparatus, geometry, Budget(time_s), seed)
+            try:
+                answer = way.measure(apparatus, geometry, Budget(time_s), seed)
+            except (TooShort, RigError):
+                raise
+            except Exception as error:
+                error.add_note(f"raised by the strategy {way.name} in {time_s * 1e3:g} ms: tell its authors")
+                raise
             require_form(answer, way.name, geometry.shape)
             spent = apparatus.spent
             if spent.time_s > time_s * (1 + OVERSPENT):

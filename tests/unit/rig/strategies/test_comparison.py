@@ -148,6 +148,16 @@ def test_a_way_that_overspends_is_an_error(config, monkeypatch):
         compare_strategies(config, strategies=["greedy"], times=["2ms"], scenes=["ramp"], fogs=["clear"], rows=4)
 
 
+def test_a_way_that_raises_is_named(config, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("of its own")
+
+    monkeypatch.setattr(type(find_strategy("gray-spad")), "measure", broken)
+    with pytest.raises(ZeroDivisionError) as raised:
+        compare_strategies(config, strategies=["gray-spad"], times=["2ms"], scenes=["ramp"], fogs=["clear"], rows=4)
+    assert raised.value.__notes__ == ["raised by the strategy gray-spad in 2 ms: tell its authors"]
+
+
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
