@@ -37,7 +37,7 @@ def test_an_older_report_is_replaced_and_nothing_else(rig: Rig, run: Path) -> No
     file = Path("page.html").absolute()
     assert rig("report", run, "--out", file, "--map", 0).code == 0
     first = file.read_text()
-    assert "Depth, map 0;" in first
+    assert "Depth, map 0 from" in first
     assert rig("report", run, "--out", file).code == 0
     assert is_report(file)
     assert file.read_text() != first
