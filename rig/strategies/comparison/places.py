@@ -12,8 +12,9 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, FileError
 from calibration.files.rig_file import load_rig_model
+from calibration.files.sections import load_yaml
 from calibration.model.rig_model import RigModel
 from drivers.units import parse_quantity
 from rig.config.bundled import bundled_scenes
@@ -88,14 +89,12 @@ def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     if path.is_dir():
         return {"surfaces": str(path.resolve())}
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        reason = str(error).partition("\n")[0]
+        content = load_yaml(path, "a scene", "surfaces: street").content
+    except FileError as error:
+        reason = "; ".join(error.problems)
         raise UsageError(
             f"scene {scene!r} cannot be read ({reason}); name a bundled scene, a scene file, a folder or {RAMP!r}"
         ) from error
-    if not isinstance(content, dict):
-        raise UsageError(f"scene {scene!r} is no scene file; it must be a mapping such as 'surfaces: street'")
     surfaces = content.get("surfaces", "street")
     if isinstance(surfaces, str) and surfaces not in ("street", "board"):
         content["surfaces"] = str((path.parent / surfaces).resolve())
