@@ -13,7 +13,7 @@ from calibration.errors import CalibrationError
 from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import Lag, RigModel
 from drivers.errors import DeviceError
-from drivers.interfaces import SweepTruth
+from drivers.interfaces import Rule, SweepTruth
 from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.units import parse_quantity
 from sim_backend.bench import Bench, BenchState
@@ -30,7 +30,7 @@ from sim_backend.scenes.medium import Section
 from sim_backend.scenes.scene import CLEAR, BoardPlace, load_scene, load_surfaces, with_board_at, with_fog
 
 if TYPE_CHECKING:
-    from sim_backend.projector.apparatus import Rule, SimulatedApparatus
+    from sim_backend.projector.apparatus import SimulatedApparatus
     from sim_backend.projector.transport import Transport
 
 LEAST_PIXELS = 2
@@ -278,7 +278,7 @@ class SimulatedWorld:
         return flux_row(self, row, command, power_w, exposure_s)
 
     def apparatus(
-        self, *, rows: ArrayLike, columns: int, command_range: tuple[float, float], power_w: float, rule: "Rule",
+        self, *, rows: ArrayLike, columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
         seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
     ) -> "SimulatedApparatus":  # fmt: skip
         """The scene before other light sources and cameras, at time 0: see `rig.strategies.apparatus.MakesApparatus`.

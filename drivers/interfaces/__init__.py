@@ -5,6 +5,7 @@ Input: a power (`LineLaser`), a waveform (`BeamScanner`), pulses of the gate (`S
 """
 
 from drivers.interfaces.apparatus import PulseTimes as PulseTimes
+from drivers.interfaces.apparatus import Rule as Rule
 from drivers.interfaces.apparatus import Spent as Spent
 from drivers.interfaces.device import Device as Device
 from drivers.interfaces.device import DeviceState as DeviceState

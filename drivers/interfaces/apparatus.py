@@ -1,9 +1,15 @@
-"""Results that an apparatus gives to a way of measuring depth (`rig.strategies.apparatus`), whoever makes them."""
+"""Rule by which an apparatus (`rig.strategies.apparatus`) shares its light, and its results, whoever makes them."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+Rule = Literal["energy", "irradiance"]
+"""Rule by which columns share the light. `energy`: the columns that are lit share the whole power, so a line is
+brighter than a picture. `irradiance`: a lit column has the same brightness however many are lit. It is that of the
+whole power spread over half of the columns."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,19 +8,15 @@ simulated apparatus is `sim_backend.projector`. Every apparatus adds up the time
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interfaces import PulseTimes as PulseTimes
+from drivers.interfaces import Rule as Rule
 from drivers.interfaces import Spent as Spent
 from drivers.interfaces import World
-
-Rule = Literal["energy", "irradiance"]
-"""Rule by which columns share the light. `energy`: the columns that are lit share the whole power, so a line is
-brighter than a picture. `irradiance`: a lit column has the same brightness however many are lit. It is that of the
-whole power spread over half of the columns."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ import numpy as np
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
 from rig.strategies.block_matching import BLOCK_PX, bands, best_match, exposed, independent_values, match
-from rig.strategies.lidar import RIGHT, within
-from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
+from rig.strategies.lidar import within
+from rig.strategies.strategy import BEYOND, GOOD, Answer, ColumnGeometry, Light, TooShort
 
 DOT_ROWS, DOT_COLUMNS = 2, 2
 """Rows and columns of a dot: about two pixels, as large as a dot of Kinect in the picture of its camera."""
@@ -98,7 +98,7 @@ def depth_of_dots(picture: Float32, shown: Float32, geometry: ColumnGeometry) ->
         found = best_match(*match(seen, iter(known), independent), independent, STEP_PX)
         step = inverse[1] - inverse[0]
         at = np.interp(found.place, np.arange(number), inverse)
-        sure = found.confidence * within(RIGHT * at, step * found.sd.astype(np.float64))
+        sure = found.confidence * within(GOOD * at, step * found.sd.astype(np.float64))
         wanted = slice(rows.start + kept.start, rows.start + kept.stop)
         depth[wanted], confidence[wanted] = (1 / at)[kept], sure[kept]
     none = geometry.defects | ~np.isfinite(depth)

@@ -29,15 +29,13 @@ import numpy as np
 from rig.simd import Float64
 from rig.strategies.apparatus import Apparatus, Budget, PulseTimes
 from rig.strategies.photon_times import TimedSurfaces, surfaces
-from rig.strategies.strategy import Answer, ColumnGeometry, Light, TooShort
+from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, TooShort
 
 LIGHT_M_PER_S: Final = 299792458.0
 """Speed of light, exact by definition of the SI."""
 BINS_PER_SIGMA: Final = 1.0
 """Bins per standard deviation of the pulse. A twelfth of the squared width of a bin adds to the pulse's variance, which
 makes the error 4 % larger."""
-RIGHT: Final = 0.02
-"""Share of the depth within which an answer counts as right."""
 NEIGHBOURS: Final = 8
 """Pixels on either side whose first photons say whether the first photon of a pixel came from a surface."""
 NEAR_SIGMAS, AROUND_SIGMAS = 3.0, 15.0
@@ -77,8 +75,8 @@ class FlashLidar:
             flat = surfaces(seen, sigma_s, between_s, fog=self.method == "gamma", coates=self.coates)
             found = TimedSurfaces(*(values.reshape(path.shape) for values in flat))
         depth_m = found.time_s / path
-        good = usable & (depth_m >= near_m * (1 - RIGHT)) & (depth_m <= far_m * (1 + RIGHT))
-        near_enough = within(RIGHT * found.time_s, found.sd_s)
+        good = usable & (depth_m >= near_m * (1 - GOOD)) & (depth_m <= far_m * (1 + GOOD))
+        near_enough = within(GOOD * found.time_s, found.sd_s)
         confidence = np.where(good, np.nan_to_num(found.confidence * near_enough), 0.0)
         return Answer(np.where(good, depth_m, np.nan).astype(np.float32), confidence.astype(np.float32))
 

@@ -28,8 +28,8 @@ from rig.errors import UsageError
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
 from rig.strategies.block_matching import bands, best_match, exposed, independent_values, match
-from rig.strategies.lidar import RIGHT, within
-from rig.strategies.strategy import BEYOND, Answer, ColumnGeometry, Light, TooShort
+from rig.strategies.lidar import within
+from rig.strategies.strategy import BEYOND, GOOD, Answer, ColumnGeometry, Light, TooShort
 
 MATCHED_BLOCK_PX: Final = 5
 """Block of the matcher, as OpenCV recommends: odd, 3 to 11."""
@@ -150,7 +150,7 @@ def _matched(
         # The blocks have a place between pixels of their own, which is not drawn to whole pixels.
         finer = np.isfinite(found) & (np.abs(block.place - at) < 0.5)
         found = np.where(finer, least + block.place, found)
-        believed = np.where(np.isfinite(found), block.confidence * within(RIGHT * np.nan_to_num(found), sd), 0)
+        believed = np.where(np.isfinite(found), block.confidence * within(GOOD * np.nan_to_num(found), sd), 0)
         wanted = slice(part.start + kept.start, part.start + kept.stop)
         disparity[wanted], sure[wanted] = found[kept], believed[kept]
     return disparity, sure

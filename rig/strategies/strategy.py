@@ -27,6 +27,8 @@ GROUP: Final = "spadrig.strategies"
 Light = Literal["spot", "line", "pattern", "flash", "ambient"]
 """The part that the source lights at a time: a spot, one or more lines, a pattern, the whole picture with pulses, or
 nothing, with ambient light only."""
+GOOD: Final = 0.02
+"""Largest error of a good answer, as a share of the depth."""
 BEYOND: Final = 0.1
 """An answer may lie beyond the depth range by this share of the inverse depth at its end, as in depth maps."""
 

@@ -15,12 +15,11 @@ the number of rows over which the fan spreads.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drivers.interfaces import PulseTimes, Spent
+from drivers.interfaces import PulseTimes, Rule, Spent
 from sim_backend.effects.setting import Array, Setting
 from sim_backend.frames.flux import FluxModel
 from sim_backend.projector.draws import SensorBits, add_counts, readings
@@ -29,7 +28,6 @@ from sim_backend.projector.pulse import blur_s, echoes, first_photons, gate
 from sim_backend.projector.stereo import ambient_radiance, first_view, second_view
 from sim_backend.projector.transport import Float32, Moment, Transport, blocks
 
-Rule = Literal["energy", "irradiance"]
 Counts = NDArray[np.uint32]
 
 MOST_FRAMES = 2**32 - 1

@@ -28,8 +28,8 @@ from rig.simd import Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
 from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
-from rig.strategies.comparison.score import GOOD, Score, score, scored_pixels
-from rig.strategies.strategy import Answer, ColumnGeometry, Light, Strategy, TooShort
+from rig.strategies.comparison.score import Score, score, scored_pixels
+from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort
 from rig.tradeoff.effects import open_world
 
 LINES: Final = 8

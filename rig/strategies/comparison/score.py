@@ -14,10 +14,8 @@ import numpy as np
 from drivers.interfaces import SweepTruth
 from rig.geometry.stripe_table import MISSING_PX
 from rig.simd import Bools
-from rig.strategies.strategy import Answer, ColumnGeometry
+from rig.strategies.strategy import GOOD, Answer, ColumnGeometry
 
-GOOD: Final = 0.02
-"""Largest error of a good answer, as a share of the depth."""
 CONFIDENT: Final = 0.9
 """Least confidence of a confident answer."""
 SAME_PX: Final = 1.5

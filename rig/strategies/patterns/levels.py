@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from rig.simd import Bools, Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget
-from rig.strategies.comparison.score import GOOD
-from rig.strategies.strategy import Answer, ColumnGeometry, TooShort
+from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, TooShort
 
 Camera = Literal["spad", "camera"]
 ROUNDING: Final = 1e-9

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.simd import Float64
-from rig.strategies.comparison.score import GOOD
-from rig.strategies.strategy import ColumnGeometry
+from rig.strategies.strategy import GOOD, ColumnGeometry
 
 Number = TypeVar("Number", np.int64, np.float64)
 
