@@ -10,8 +10,8 @@ import numpy as np
 
 from calibration.files.rig_file import load_rig_model
 from rig.config.overrides import configure
-from rig.strategies.apparatus import Spent
-from rig.strategies.strategy import ColumnGeometry
+from rig.strategies.apparatus import Budget, Spent
+from rig.strategies.strategy import ColumnGeometry, Strategy, TooShort
 
 F_PX, CENTRE_PX, WIDTH = 600.0, 255.5, 512
 BASELINE_M, ANGLE0, PER_COMMAND = 0.3, 0.0872, 0.5315
@@ -102,3 +102,26 @@ def seen(depth_m):
     """Pixels whose surface is lit by some column."""
     column = true_column(depth_m)
     return (column >= 0) & (column <= COLUMNS - 1)
+
+
+def confident_answers(strategy: Strategy, time_s: float) -> tuple[int, int]:
+    """Numbers of confident answers and of wrong ones among them, over walls in four lights."""
+    sure, wrong = 0, 0
+    for seed, signal in enumerate((500.0, 2e3, 8e3, 3e4)):
+        depth = walls(seed)
+        answer = strategy.measure(Bench(depth, signal=signal, seed=seed), geometry(), Budget(time_s), 0)
+        confident = (answer.confidence >= 0.9) & seen(depth)
+        sure += int(confident.sum())
+        wrong += int((confident & ~(np.abs(answer.depth_m - depth) <= 0.02 * depth)).sum())
+    return sure, wrong
+
+
+def check_time(strategy: Strategy, times_s: tuple[float, ...]) -> None:
+    """Each time is kept, or refused before any light."""
+    for time_s in times_s:
+        bench = Bench(walls())
+        try:
+            strategy.measure(bench, geometry(), Budget(time_s), 0)
+        except TooShort:
+            assert not bench.calls
+        assert bench.time_s <= time_s * (1 + 1e-9)

@@ -20,7 +20,16 @@ from rig.strategies.patterns.binary_codes import (
 )
 from rig.strategies.strategy import TooShort
 from tests.stability.inventory import covers
-from tests.unit.rig.strategies.patterns.bench import Bench, geometry, off_columns, seen, true_column, walls
+from tests.unit.rig.strategies.patterns.bench import (
+    Bench,
+    check_time,
+    confident_answers,
+    geometry,
+    off_columns,
+    seen,
+    true_column,
+    walls,
+)
 
 covers(plain_code, gray_code, plain_number, gray_number, bits_for, two_levels)
 STRATEGIES = [each for each in vars(binary_codes).values() if isinstance(each, BinaryCode)]
@@ -105,13 +114,7 @@ def test_borders_are_interpolated_along_the_row() -> None:
 
 def test_confident_answers_are_right() -> None:
     for strategy in STRATEGIES:
-        sure, wrong = 0, 0
-        for seed, signal in enumerate((500.0, 2e3, 8e3, 3e4)):
-            depth = walls(seed)
-            answer = strategy.measure(Bench(depth, signal=signal, seed=seed), geometry(), Budget(0.05), 0)
-            confident = (answer.confidence >= 0.9) & seen(depth)
-            sure += int(confident.sum())
-            wrong += int((confident & ~(np.abs(answer.depth_m - depth) <= 0.02 * depth)).sum())
+        sure, wrong = confident_answers(strategy, 0.05)
         assert sure > 100, strategy.name
         assert wrong <= 0.1 * sure, strategy.name
 
@@ -125,12 +128,6 @@ def test_without_light_there_is_no_confident_answer() -> None:
 
 def test_the_time_is_kept_or_refused_before_any_light() -> None:
     for strategy in STRATEGIES:
-        for time_s in (1e-3, 0.0123, 0.05, 1.0):
-            bench = Bench(walls())
-            try:
-                strategy.measure(bench, geometry(), Budget(time_s), 0)
-            except TooShort:
-                assert not bench.calls
-            assert bench.time_s <= time_s * (1 + 1e-9)
+        check_time(strategy, (1e-3, 0.0123, 0.05, 1.0))
     with pytest.raises(TooShort, match=r"16 patterns take 0\.00016 s, the budget is 0\.0001 s"):
         BINARY_INVERSE_SPAD.measure(Bench(walls()), geometry(), Budget(1e-4), 0)

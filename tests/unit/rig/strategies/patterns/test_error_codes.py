@@ -22,7 +22,15 @@ from rig.strategies.patterns.error_codes import (
 )
 from rig.strategies.strategy import TooShort
 from tests.stability.inventory import covers
-from tests.unit.rig.strategies.patterns.bench import Bench, geometry, off_columns, seen, walls
+from tests.unit.rig.strategies.patterns.bench import (
+    Bench,
+    check_time,
+    confident_answers,
+    geometry,
+    off_columns,
+    seen,
+    walls,
+)
 
 covers(bch_words, code_book, correctable, generator)
 STRATEGIES = [each for each in vars(error_codes).values() if isinstance(each, ErrorCode)]
@@ -131,13 +139,7 @@ def test_the_likeliest_word_is_right_more_often_than_the_nearest() -> None:
 
 def test_confident_answers_are_right() -> None:
     for strategy in STRATEGIES:
-        sure, wrong = 0, 0
-        for seed, signal in enumerate((500.0, 2e3, 8e3, 3e4)):
-            depth = walls(seed)
-            answer = strategy.measure(Bench(depth, signal=signal, seed=seed), geometry(), Budget(0.05), 0)
-            confident = (answer.confidence >= 0.9) & seen(depth)
-            sure += int(confident.sum())
-            wrong += int((confident & ~(np.abs(answer.depth_m - depth) <= 0.02 * depth)).sum())
+        sure, wrong = confident_answers(strategy, 0.05)
         assert sure > 100, strategy.name
         assert wrong <= 0.1 * sure, (strategy.name, sure, wrong)
 
@@ -150,13 +152,7 @@ def test_without_light_there_is_no_confident_answer() -> None:
 
 def test_the_time_is_kept_or_refused_before_any_light() -> None:
     for strategy in STRATEGIES:
-        for time_s in (1e-4, 1e-3, 0.0123, 0.05, 1.0):
-            bench = Bench(walls())
-            try:
-                strategy.measure(bench, geometry(), Budget(time_s), 0)
-            except TooShort:
-                assert not bench.calls
-            assert bench.time_s <= time_s * (1 + 1e-9)
+        check_time(strategy, (1e-4, 1e-3, 0.0123, 0.05, 1.0))
 
 
 def test_it_says_that_it_is_for_comparison_only(caplog) -> None:

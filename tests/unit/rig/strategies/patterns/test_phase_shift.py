@@ -21,9 +21,16 @@ from rig.strategies.patterns.phase_shift import (
     unit_codes,
     whole_period,
 )
-from rig.strategies.strategy import TooShort
 from tests.stability.inventory import covers
-from tests.unit.rig.strategies.patterns.bench import Bench, geometry, off_columns, seen, walls
+from tests.unit.rig.strategies.patterns.bench import (
+    Bench,
+    check_time,
+    confident_answers,
+    geometry,
+    off_columns,
+    seen,
+    walls,
+)
 
 covers(fitted_sines, micro_periods, micro_sines, phase_of, shifted_sines, unit_codes, whole_period)
 STRATEGIES = [each for each in vars(phase_shift).values() if isinstance(each, (PhaseShift, MicroPhaseShift))]
@@ -136,13 +143,7 @@ def test_other_numbers_of_shifts_are_refused(shifts) -> None:
 
 def test_confident_answers_are_right() -> None:
     for strategy in STRATEGIES:
-        sure, wrong = 0, 0
-        for seed, signal in enumerate((500.0, 2e3, 8e3, 3e4)):
-            depth = walls(seed)
-            answer = strategy.measure(Bench(depth, signal=signal, seed=seed), geometry(), Budget(0.3), 0)
-            confident = (answer.confidence >= 0.9) & seen(depth)
-            sure += int(confident.sum())
-            wrong += int((confident & ~(np.abs(answer.depth_m - depth) <= 0.02 * depth)).sum())
+        sure, wrong = confident_answers(strategy, 0.3)
         assert wrong <= 0.1 * sure + 5, (strategy.name, sure, wrong)
         assert sure > 100 or strategy in (PHASE_CAMERA, PHASE_SPAD), strategy.name
 
@@ -156,13 +157,7 @@ def test_without_light_there_is_no_confident_answer() -> None:
 
 def test_the_time_is_kept_or_refused_before_any_light() -> None:
     for strategy in STRATEGIES:
-        for time_s in (5e-5, 1e-3, 0.0123, 0.05, 1.0):
-            bench = Bench(walls())
-            try:
-                strategy.measure(bench, geometry(), Budget(time_s), 0)
-            except TooShort:
-                assert not bench.calls
-            assert bench.time_s <= time_s * (1 + 1e-9)
+        check_time(strategy, (5e-5, 1e-3, 0.0123, 0.05, 1.0))
 
 
 def test_a_clipped_pixel_has_no_confidence() -> None:
