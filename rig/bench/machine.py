@@ -5,6 +5,8 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from drivers.cores import cores
+
 _CPU_INFO = Path("/proc/cpuinfo")
 _CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
 """Files in which Linux describes itself; other systems have none, and caches are left out."""
@@ -17,7 +19,7 @@ def machine() -> dict[str, Any]:
 
     return {
         "processor": _processor(),
-        "cores": os.cpu_count() or 1,
+        "cores": cores(),
         "caches": _caches(),
         "load_1min": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "system": platform.platform(),

@@ -4,7 +4,6 @@ A round measures each row for a short time, and reads the memory in between; res
 measurement begins after the frames of the previous one, so that frames come from memory and not from a cache.
 """
 
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.errors import digits
+from drivers.cores import cores
 from rig.bench import stages
 from rig.bench.frames import (
     COLUMNS,
@@ -193,7 +193,7 @@ def measure_speed(
     """
     begun = time.perf_counter()
     extent = extent or Extent()
-    most = threads or os.cpu_count() or 1
+    most = threads or cores()
     found = machine()
     with ExitStack() as stack:
         # Two threads are measured on bigger machines too, since claims are for two cores.

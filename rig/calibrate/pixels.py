@@ -9,7 +9,6 @@ and dark rates), dark_rate.png, report.html and summary.json. The statistics are
 """
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -24,6 +23,7 @@ from calibration import pixel_map
 from calibration.errors import CalibrationError, digits
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.verdict import Reason, Verdict
+from drivers.cores import cores
 from drivers.frames import FrameBlock, frame_bytes
 from drivers.interfaces import SpadInfo, SpadMode, SpadRequest
 from drivers.recorded.segments import segment_files
@@ -114,7 +114,7 @@ def take_dark(
     request = _request(rig.config.scan, info, per_start)
     timing = rig.spad.configure(request)
     rig.sync.gate_low()
-    workers = RowWorkers(rig.config.estimate.threads or os.cpu_count() or 1)
+    workers = RowWorkers(rig.config.estimate.threads or cores())
     # A layout for dark frames only: its one column is never counted.
     layout = SweepLayout(1, info.height, info.width, np.zeros(1, np.int32), WORD_PX, 1)
     counter = SweepCounter(layout, workers)

@@ -284,7 +284,7 @@ def report(result: "RunResult") -> CommandResult:
 
 def print_json(content: Mapping[str, Any]) -> None:
     """Print the one JSON object of a command to stdout."""
-    from rig.run_folder.folder import json_text
+    from rig.run_folder.plain_json import json_text
 
     print(in_options(json_text(content)))
 

@@ -1,6 +1,5 @@
 """From the counts of a sweep to its map: stripe table, depth map, intensity, fog and doubts."""
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.model.rig_model import RigModel
+from drivers.cores import cores
 from rig.config.models import EstimateConfig
 from rig.count.map_checks import MapChecks
 from rig.count.volume import Counter, FrameTally, LineCounter, SweepLayout
@@ -122,7 +122,7 @@ class Reconstructor:
         self._name = estimate.estimator
         self._coupled = is_coupled(self._name)
         self._lines = lines
-        threads = estimate.threads or os.cpu_count() or 1
+        threads = estimate.threads or cores()
         self._workers = RowWorkers(threads)
         prior = estimate.temporal_prior
         if learned:

@@ -26,7 +26,7 @@ from drivers.frames import FrameBlock
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
 from rig.exchange.npy import FrameLog, MapFiles
-from rig.run_folder.folder import json_text
+from rig.run_folder.plain_json import json_text
 
 FILE: Final = "run.h5"
 _USER_BLOCK: Final = 512

@@ -19,7 +19,8 @@ from calibration.model.camera import Camera
 from drivers.frames import BlockHeader, FrameBlock, Mark
 from rig.errors import UsageError
 from rig.exchange.photoncube import SIDECAR_FORMAT, TRANSFORMS
-from rig.run_folder.folder import RunFolder, json_text
+from rig.run_folder.folder import RunFolder
+from rig.run_folder.plain_json import json_text
 
 CUBE: Final = "frames.npy"
 Ranges = list[tuple[int, int, int]]

@@ -13,10 +13,13 @@ except ImportError:  # on Windows nobody else can change a file that is open
     fcntl = None  # type: ignore[assignment]
 
 
-def hold(fd: int) -> None:
-    """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock."""
+def hold(fd: int, *, shared: bool = False) -> None:
+    """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock.
+
+    shared: allow other processes to hold it too, as shared.
+    """
     if fcntl is not None:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(fd, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
 
 
 def is_held(file: Path) -> bool:

@@ -12,16 +12,13 @@ loss of power.
 """
 
 import io
-import json
 import logging
-import math
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from fractions import Fraction
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -48,6 +45,7 @@ from rig.run_folder.pictures import (
     ply_bytes,
     png_bytes,
 )
+from rig.run_folder.plain_json import json_text
 
 _log = logging.getLogger(__name__)
 
@@ -226,11 +224,6 @@ class RunFolder:
             raise
 
 
-def json_text(content: Mapping[str, Any]) -> str:
-    """Content as strict JSON. NaN and infinity become null, arrays lists, fractions numbers, and all else text."""
-    return json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
-
-
 @dataclass(frozen=True, slots=True)
 class SavePolicy:
     """The maps of a run that are written (`save`). step: maps 0, step, 2 step, ...; None: only the last."""
@@ -266,22 +259,6 @@ def _renamed(folder: Path, target: Path) -> bool:
             raise
         return False
     return True
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, Fraction):
-        return _plain(float(value))
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int | bool):
-        return value
-    return str(value)
 
 
 def _unwritable(path: Path, error: OSError) -> UsageError:

@@ -8,7 +8,6 @@ with these threads is measured just before the scan.
 """
 
 import math
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.errors import digits
+from drivers.cores import cores
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.volume import CountVolume
 from rig.errors import UsageError
@@ -67,7 +67,7 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
         return "likelihood", "joint would take too much memory"
     if math.isinf(map_time_s):
         return "joint", "no frame waits for its maps"
-    took_s = time_of_map(geometry, estimate.threads or os.cpu_count() or 1)
+    took_s = time_of_map(geometry, estimate.threads or cores())
     name = "joint" if took_s <= KEPT_UP * map_time_s else "likelihood"
     return name, f"a map of joint takes {digits(1e3 * took_s, 2)} ms, a sweep {digits(1e3 * map_time_s, 2)} ms"
 

@@ -29,8 +29,8 @@ from rig.errors import RecordingError, UsageError
 from rig.recording.open import fitted_ratio
 from rig.recording.writer import WRITERS, Recording, next_block
 from rig.run_folder.disk import replace_file
-from rig.run_folder.folder import json_text
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, RunVerdict, file_crc32, sealed_text
+from rig.run_folder.plain_json import json_text
 
 _log = logging.getLogger(__name__)
 

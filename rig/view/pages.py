@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rig.run_folder.folder import json_text
+from rig.run_folder.plain_json import json_text
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection

@@ -17,7 +17,6 @@ In the simulation W changes in steps, one every millisecond of the counter. An o
 and by 1 ppm more per K; a wander of 0.1 ppm per root second is much.
 """
 
-import os
 from fractions import Fraction
 from typing import Annotated, ClassVar, Literal
 
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import NS_PER_S, VirtualClock
+from drivers.cores import cores
 from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded
 from drivers.frames import FRAME_RECORD, SUBFRAME_SHIFT, BlockFlag, BlockHeader, Mark
 from drivers.interfaces import SpadArray, SpadCounters, SpadInfo, SpadRequest, SpadTiming, StreamMode, WindowTable
@@ -220,7 +220,7 @@ class SimulatedSpad(SpadArray):
         world = self._world
         self._exposure_s, self._period_s = float(exposure / tick_hz), float(period / tick_hz)
         times = FrameTimes(self._exposure_s, self._period_s)
-        self._photons = world.photons(times, self._seed, min(MAX_THREADS, os.cpu_count() or 1))
+        self._photons = world.photons(times, self._seed, min(MAX_THREADS, cores()))
         return self._timing
 
     def _do_start(self, n_frames: int | None) -> None:

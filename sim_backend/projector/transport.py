@@ -16,7 +16,6 @@ F is float32 (rows, columns, width): 2 kB per pixel for 500 columns. For computi
 """
 
 import math
-import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.model.rig_model import RigModel
+from drivers.cores import cores
 from drivers.errors import DeviceError
 from sim_backend.effects.particles import HOLD_S, ParticleLight, Particles
 from sim_backend.effects.setting import Array
@@ -110,7 +110,7 @@ class Transport:
     def _computed(self, spots: bool) -> Float32:
         columns = len(self._sheets)
         light = np.zeros((len(self.rows), columns, self._view.width), np.float32)
-        threads = max(1, min(os.cpu_count() or 1, MOST_THREADS, columns))
+        threads = max(1, min(cores(), MOST_THREADS, columns))
         cuts = np.linspace(0, columns, threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads, thread_name_prefix="transport") as pool:
             list(pool.map(partial(self._fill, light, spots), *zip(*pairwise(cuts), strict=True)))

@@ -8,7 +8,6 @@ Everything runs in the host's time. Frames are drawn when the host takes them, f
 exposed. If the simulation takes longer than the exposures, frames wait in the SPAD's memory.
 """
 
-import os
 import threading
 from contextlib import closing
 from typing import Annotated, Any, ClassVar, Literal
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.clock import Clock, now_s
+from drivers.cores import cores
 from drivers.errors import DeviceError
 from drivers.frames import FRAME_RECORD, packed_row_bytes
 from drivers.lasers.ttl import BY_HAND
@@ -173,7 +173,7 @@ class EmulatedWorld(SimulatedWorld):
 
     def photon_source(self, times: FrameTimes) -> PhotonSource:
         """A source of frames with this timing."""
-        return self.photons(times, self._seed, min(MAX_THREADS, os.cpu_count() or 1))
+        return self.photons(times, self._seed, min(MAX_THREADS, cores()))
 
     def _draw_once(self) -> None:
         """Draw a lit frame before time counts: once the laser is armed, nothing may be left to plan or to compile."""

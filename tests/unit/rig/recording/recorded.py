@@ -8,8 +8,8 @@ from typing import Any
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from rig.recording.writer import Recording
-from rig.run_folder.folder import json_text
 from rig.run_folder.manifest import MANIFEST, sealed_text
+from rig.run_folder.plain_json import json_text
 from tests.unit.rig.count.streams import plan_of, scan, stream_of
 
 MAPS = 3

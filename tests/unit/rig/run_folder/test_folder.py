@@ -15,8 +15,9 @@ from rig.depth.depth import DepthMap
 from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.geometry.stripe_table import StripeTable
 from rig.recording.writer import Recording
-from rig.run_folder.folder import RunFolder, json_text
+from rig.run_folder.folder import RunFolder
 from rig.run_folder.pictures import SCALE_PX
+from rig.run_folder.plain_json import json_text
 from tests.unit.rig.recording.recorded import run_blocks
 
 ROWS, WIDTH, COLUMNS = 40, 60, 7

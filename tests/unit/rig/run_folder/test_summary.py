@@ -14,8 +14,9 @@ from rig.depth.reconstruct import FogEstimate, MapResult
 from rig.devices.open import light_problems
 from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
-from rig.run_folder.folder import SavePolicy, json_text
+from rig.run_folder.folder import SavePolicy
 from rig.run_folder.manifest import RunVerdict
+from rig.run_folder.plain_json import json_text
 from rig.run_folder.summary import MapTally, RunFrames
 
 

@@ -1,0 +1,130 @@
+"""A case: a function, and inputs on which alone its result depends.
+
+A case is named by a digest of all that decides its result: the function, its inputs, the contents of the files that it
+reads, and the code. So the same case has the same name on every computer, and a result under another name is of
+something else. The function is called with the inputs and returns a mapping. What it returns under `measured`, such as
+times, may differ from computer to computer; everything else must not.
+"""
+
+import functools
+import hashlib
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.recorded.contents import INDEX_FILE
+from rig.errors import UsageError
+from rig.kernel_cache import TOP
+from rig.run_folder.manifest import MANIFEST
+from rig.run_folder.plain_json import json_line
+
+OWN_PACKAGES: Final = "calibration", "config", "drivers", "rig", "sim_backend", "spadrig"
+CODE_SUFFIXES: Final = ".py", ".yaml", ".npz"
+NUMERIC_PACKAGES: Final = "numpy", "numba", "opencv-contrib-python-headless"
+"""Packages whose versions count as code: their results may differ in the last digits."""
+MEASURED: Final = "measured"
+NAME_DIGITS: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A function with its inputs.
+
+    function: 'package.module:name'. inputs: plain values, passed as keyword arguments. labels: what tells this case
+    from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
+    """
+
+    function: str
+    inputs: Mapping[str, Any]
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    files: tuple[str, ...] = ()
+
+    def call(self) -> Mapping[str, Any]:
+        """The result, computed here and now. Raises what the function raises."""
+        return call(self.function, self.inputs)
+
+    def name(self, code: str, checksums: Mapping[str, str]) -> str:
+        """The case's name. code: of `code_digest`; checksums: of all `files`."""
+        files = {path: checksums[path] for path in self.files}
+        made_of = {"function": self.function, "inputs": self.inputs, "files": files, "code": code}
+        return hashlib.sha256(json_line(made_of).encode()).hexdigest()[:NAME_DIGITS]
+
+
+def call(function: str, inputs: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Call a function by its name, 'package.module:name'. Raises TypeError if it returns no mapping."""
+    module, _, name = function.partition(":")
+    result = getattr(import_module(module), name)(**inputs)
+    if not isinstance(result, Mapping):
+        raise TypeError(f"{function} returned {type(result).__name__}; the result of a case is a mapping")
+    return result
+
+
+@functools.cache
+def code_digest(package: str = "rig") -> str:
+    """Digest of our code and of the versions that matter, together with the code of the package of a case's function.
+
+    package: the first part of the function's name.
+    """
+    digest = hashlib.sha256()
+    folders = [TOP / name for name in OWN_PACKAGES]
+    if package not in OWN_PACKAGES and (spec := find_spec(package)) is not None:
+        folders += map(Path, list(spec.submodule_search_locations or [spec.origin or ""])[:1])
+    for folder in folders:
+        for file in sorted(_sources(folder)):
+            path = file.relative_to(folder.parent)
+            digest.update(f"{path} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+    digest.update(repr(numeric_versions()).encode())
+    return digest.hexdigest()[:NAME_DIGITS]
+
+
+def package_of(function: str) -> str:
+    """The top-level package of a function's name."""
+    return function.partition(":")[0].partition(".")[0]
+
+
+def numeric_versions() -> dict[str, str]:
+    """Versions of the interpreter and of NUMERIC_PACKAGES."""
+    found = {"python": ".".join(map(str, sys.version_info[:2]))}
+    for name in NUMERIC_PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # installed under another name, as distributions repackage it
+            continue
+    return found
+
+
+def checksum(path: str) -> str:
+    """Checksum of a file, or of all files in a folder. Raises UsageError if it cannot be read.
+
+    Frames of a recording are not read. Its manifest and index are, which have the checksums of all blocks.
+    """
+    top = Path(path)
+    try:
+        if not top.is_dir():
+            return _checksum_of_file(top)
+        recorded = (top / INDEX_FILE).exists()
+        lines = []
+        for file in sorted(each for each in top.rglob("*") if each.is_file()):
+            read = not recorded or file.name in (MANIFEST, INDEX_FILE)
+            what = _checksum_of_file(file) if read else str(file.stat().st_size)
+            lines.append(f"{file.relative_to(top)} {what}\n")
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror or error}; correct the path") from error
+
+
+def _checksum_of_file(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _sources(top: Path) -> Iterator[Path]:
+    """The files of a package, or the only file of a module."""
+    for file in top.rglob("*") if top.is_dir() else (top,):
+        if file.suffix in CODE_SUFFIXES and "__pycache__" not in file.parts:
+            yield file

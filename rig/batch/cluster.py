@@ -1,0 +1,250 @@
+"""An executor that sends cases to the workers of a dask cluster (dask.distributed).
+
+A task returns only its name and how it ended; results are files in a folder that all workers must see. So a worker that
+is lost takes nothing with it. Each thread of a dask worker has a process of its own for the cases, which can be ended
+when a case hangs or takes too much memory. A worker with another version of the code, or without the folder, is retired
+as soon as it shows; its cases go to others.
+"""
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from itertools import count
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, Final
+
+from calibration.errors import FileError
+from calibration.files.sections import load_yaml
+from drivers.optional_packages import install_command
+from rig.batch.case import checksum, code_digest
+from rig.batch.pool import Limits, Pool
+from rig.batch.store import Store
+from rig.batch.task import HEAD, Ended, Task
+from rig.errors import RigError, UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+AHEAD: Final = 2
+"""Tasks that are sent ahead for each thread of a worker, so that none waits for the network."""
+PATIENCE_S: Final = 300.0
+"""Seconds to wait for a scheduler that has gone away."""
+LOOK_S: Final = 1.0
+"""Seconds from one count of the workers to the next."""
+MOST_NAMED: Final = 5
+
+_of_thread = threading.local()
+_log = logging.getLogger(__name__)
+
+
+class Cluster:
+    """An executor with the workers of a dask cluster; see `rig.batch.engine.Executor`.
+
+    client: the caller's own, which stays open. close: what else is to be closed. Raises UsageError if a worker that is
+    there already cannot do the cases.
+    """
+
+    def __init__(
+        self, store: Store, client: "Client", limits: Limits | None = None, *, close: Callable[[], object] | None = None
+    ) -> None:
+        self._client = client
+        self._close = close
+        self._limits = limits or Limits()
+        self._ended: SimpleQueue[tuple[str, Future[Any]]] = SimpleQueue()
+        self._under_way: dict[str, Future[Any]] = {}
+        self._attempt = count()
+        self._threads = 0
+        self._looked_s = float("-inf")
+        self.notes: list[str] = []
+        """Sentences on workers that were retired."""
+        try:
+            _require_able(client, store)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def workers(self) -> int:
+        """Number of threads of all workers; 0 while there is no connection to the scheduler."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= LOOK_S:
+            self._looked_s = now_s
+            try:
+                connected = self._client.status == "running"
+                self._threads = sum(self._client.nthreads().values()) if connected else 0
+            except (OSError, TimeoutError):
+                self._threads = 0
+        return self._threads
+
+    @property
+    def room(self) -> int:
+        """Number of tasks that it takes now."""
+        if self._client.status != "running":
+            return 0
+        return max(1, AHEAD * self.workers) - len(self._under_way)
+
+    def submit(self, task: Task) -> None:
+        """Send a task."""
+        # Another key each time: the scheduler may still know a task whose connection broke.
+        key = f"case-{task.name}-{next(self._attempt)}"
+        future = self._client.submit(_on_worker, task, self._limits, key=key, pure=False)
+        self._under_way[task.name] = future
+        future.add_done_callback(lambda ended, name=task.name: self._ended.put((name, ended)))
+
+    def wait(self) -> list[Ended]:
+        """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone."""
+        if self._client.status == "closed":
+            raise RigError("the scheduler is gone; start it, then run this again: it goes on where it stopped")
+        ended: list[tuple[str, Future[Any]]] = []
+        try:
+            ended.append(self._ended.get(timeout=LOOK_S))
+            while True:
+                ended.append(self._ended.get_nowait())
+        except Empty:
+            pass
+        mine = [(name, future) for name, future in ended if self._under_way.get(name) is future]
+        for name, _ in mine:
+            del self._under_way[name]
+        try:
+            told = self._client.gather([f for _, f in mine if f.status == "finished"], errors="skip")
+        except (OSError, TimeoutError):
+            told = []
+        found = {each.name: each for each in told}
+        return [self._judged(found.get(name) or _lost(name, future)) for name, future in mine]
+
+    def close(self) -> None:
+        """Give up what is under way, and close what was opened for this executor."""
+        if self._client.status == "running" and self._under_way:
+            self._client.cancel(list(self._under_way.values()), force=True)
+        self._under_way.clear()
+        if self._close is not None:
+            self._close()
+            self._close = None
+
+    def _judged(self, ended: Ended) -> Ended:
+        """A task that came back undone from a worker that cannot do any is to be begun again elsewhere."""
+        if ended.status not in ("other code", "no folder"):
+            return ended
+        note = f"worker {ended.worker} was retired: {ended.message}"
+        if note not in self.notes:
+            self.notes.append(note)
+            _log.warning("%s", note)
+            self._client.retire_workers([ended.worker.partition(" ")[0]], close_workers=True)
+        return Ended(ended.name, "lost", note)
+
+
+def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
+    """An executor for what `--cluster` names: the address of a scheduler, or a YAML file about a batch system."""
+    try:
+        distributed = import_module("distributed")
+    except ImportError as error:
+        raise UsageError(f"`cluster` needs the package distributed; {install_command('distributed')}") from error
+    if "://" in cluster:
+        try:
+            client = distributed.Client(cluster, timeout=PATIENCE_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise UsageError(f"no scheduler answers at {cluster} ({error}); start one with `dask scheduler`") from error
+        return Cluster(store, client, limits, close=client.close)
+    queue = _batch_system(Path(cluster))
+    client = distributed.Client(queue, timeout=PATIENCE_S, set_as_default=False)
+
+    def close() -> None:
+        client.close()
+        queue.close()
+
+    return Cluster(store, client, limits, close=close)
+
+
+SYSTEMS: Final = {
+    "slurm": "SLURMCluster",
+    "pbs": "PBSCluster",
+    "sge": "SGECluster",
+    "lsf": "LSFCluster",
+    "htcondor": "HTCondorCluster",
+    "oar": "OARCluster",
+    "local": "local.LocalCluster",
+}
+"""Batch systems, by the class of dask-jobqueue; `local` starts the jobs as processes of this computer, for trials."""
+
+
+def _batch_system(file: Path) -> Any:
+    """The jobs that a file describes, as a cluster of dask-jobqueue. Raises UsageError."""
+    try:
+        content = dict(load_yaml(file, "a cluster", "system: slurm").content)
+    except FileError as error:
+        raise UsageError(
+            f"`cluster={file}` is no cluster ({'; '.join(error.problems)}); name local, tcp://HOST:PORT or a YAML file"
+        ) from error
+    system, jobs = content.pop("system", None), content.pop("jobs", None)
+    problems = []
+    if system not in SYSTEMS:
+        problems.append(f"{file}: system is {system!r}; it is one of {', '.join(SYSTEMS)}")
+    if not isinstance(jobs, int) or jobs < 1:
+        problems.append(f"{file}: jobs is {jobs!r}; it is the number of jobs to ask for, 1 or more")
+    if problems:
+        raise UsageError.of(problems)
+    try:
+        module = import_module("dask_jobqueue")
+    except ImportError as error:
+        raise UsageError(f"{file} needs the package dask-jobqueue; {install_command('dask-jobqueue')}") from error
+    place, _, name = SYSTEMS[system].rpartition(".")
+    kind = getattr(import_module(f"dask_jobqueue.{place}") if place else module, name)
+    try:
+        made = kind(**content)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{file}: {error}; its other keys are those of dask_jobqueue.{name}") from error
+    made.scale(jobs=jobs)
+    return made
+
+
+def _on_worker(task: Task, limits: Limits) -> Ended:
+    """Do a task in the process that belongs to this thread of a dask worker."""
+    from distributed import get_worker
+
+    name = f"{get_worker().address} {socket.gethostname()}"
+    pool = getattr(_of_thread, "pool", None)
+    if pool is None:
+        pool = _of_thread.pool = Pool(1, limits, name)
+    pool.submit(task)
+    while not (ended := pool.wait()):
+        pass
+    return ended[0]
+
+
+def _lost(name: str, future: "Future[Any]") -> Ended:
+    error = future.exception(timeout=1) if future.status == "error" else None
+    return Ended(name, "lost", f"its worker is gone ({future.status if error is None else error})")
+
+
+def _require_able(client: "Client", store: Store) -> None:
+    """Raise UsageError if a worker does not see the folder or an input, or has another version of the code."""
+    head = checksum(str(store.folder / HEAD))
+    files = store.checksums
+    found = client.run(_problems, str(store.folder), head, files, store.codes, on_error="return")
+    problems = [
+        f"worker {worker}: {problem}"
+        for worker, said in found.items()
+        for problem in (said if isinstance(said, list) else [f"{said}; install the same version of spadrig there"])
+    ]
+    if problems:
+        more = [f"and {len(problems) - MOST_NAMED} more"] if len(problems) > MOST_NAMED else []
+        raise UsageError.of([*problems[:MOST_NAMED], *more])
+
+
+def _problems(folder: str, head: str, files: Mapping[str, str], codes: Mapping[str, str]) -> list[str]:
+    """Reasons why this computer cannot do the cases of a batch."""
+    problems = []
+    for path, wanted, what in ((str(Path(folder) / HEAD), head, folder), *((p, s, p) for p, s in files.items())):
+        try:
+            seen = checksum(path)
+        except UsageError:
+            seen = ""
+        if seen != wanted:
+            problems.append(f"does not see {what}; share it under the same path, with the same content")
+    if any(code_digest(package) != code for package, code in codes.items()):
+        problems.append("has another version of the code or of its packages; install the same one")
+    return problems

@@ -1,0 +1,258 @@
+"""Runs the cases of a store with an executor, until each has a result or has failed.
+
+The store knows which cases have a result, so an interrupted batch goes on where it stopped. On every way out the table
+is written with all results that there are.
+"""
+
+import contextlib
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Final, Literal, Protocol
+
+from rig.batch.store import FAILURES, Store
+from rig.batch.task import Ended, Status, Task
+from rig.errors import UsageError
+from rig.progress import Progress, tell_stage
+from rig.run_folder.disk import replace_file
+from rig.run_folder.plain_json import json_line
+
+RETRIES: Final = 2
+"""Times that a case is done again if its process died, hung or took too much memory."""
+LOST: Final = 20
+"""Times that a case is begun again if the connection to its worker broke, which is not the fault of the case."""
+SAID_S: Final = 0.5
+
+
+class Executor(Protocol):
+    """Something that does tasks. All methods are called by one thread."""
+
+    @property
+    def workers(self) -> int:
+        """Number of cases that are done at once, now."""
+        ...
+
+    @property
+    def room(self) -> int:
+        """Number of tasks that it takes now."""
+        ...
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Sentences on what happened to workers, for the user."""
+        ...
+
+    def submit(self, task: Task) -> None:
+        """Begin a task; only if there is room."""
+        ...
+
+    def wait(self) -> list[Ended]:
+        """Tasks that have ended since the last call; waits for a moment if none has."""
+        ...
+
+    def close(self) -> None:
+        """Give up all tasks that have not ended."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A case that failed. attempts: how often it was tried. command: what repeats it alone, with its messages."""
+
+    case: str
+    labels: dict[str, object]
+    kind: Status
+    message: str
+    attempts: int
+    command: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Result of a batch. done: cases in the table, of `total`; run: those that were done now. workers: most at once.
+
+    verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, whose other cases are done elsewhere),
+    'stopped' (results could not be written any more; `reason` says why), or 'aborted' by an interrupt.
+    """
+
+    done: int
+    total: int
+    run: int
+    failures: tuple[Failure, ...]
+    verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
+    reason: str = ""
+    wall_s: float = 0.0
+    case_s: float = 0.0
+    workers: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def run_batch(
+    store: Store,
+    executor: Executor,
+    *,
+    shard: tuple[int, int] = (0, 1),
+    retries: int = RETRIES,
+    progress: Progress | None = None,
+    command: str = "rig batch",
+) -> Batch:
+    """Do all cases that have no result yet, close the executor, and write the table.
+
+    shard: (i, n), only cases i, i + n, i + 2 n, ...; progress: called with the number of finished cases and of all.
+    command: of the whole batch, for the commands that repeat a failed case. An interrupt ends the batch, with verdict
+    'aborted'; it is raised again if there is no result at all.
+    """
+    begun = time.monotonic()
+    mine = list(store.cases)[shard[0] :: shard[1]]
+    finished = store.finished()
+    runs = _Runs(store, executor, [name for name in mine if name not in finished], retries)
+    told = _Told(len(mine) - len(runs.waiting), len(mine), progress)
+    aborted = False
+    try:
+        for _ in runs.steps():
+            told.tell(runs, executor)
+    except KeyboardInterrupt:
+        aborted = True
+    finally:
+        executor.close()
+        if shard[1] == 1 or (len(store.finished()) == len(store.cases) and store.alone()):
+            done = store.pack()
+        else:
+            done = len(store.finished())
+    failures = tuple(
+        Failure(
+            end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.attempts[end.name],
+            f"{command} --case {end.name}", end.detail,
+        )
+        for end in runs.failed.values()
+    )  # fmt: skip
+    file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0]}-of-{shard[1]}.jsonl")
+    with contextlib.suppress(OSError):  # the disk is full: they are returned all the same
+        file.unlink(missing_ok=True)
+        if failures:
+            replace_file(file, "".join(json_line(asdict(failure)) for failure in failures).encode())
+    if aborted and not done:
+        raise KeyboardInterrupt
+    total = len(store.cases)
+    verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
+    if aborted:
+        verdict = "aborted"
+    elif runs.stopped:
+        verdict = "stopped"
+    elif failures:
+        verdict = "failures"
+    else:
+        verdict = "complete" if done == total else "part"
+    return Batch(
+        done, total, runs.done, failures, verdict, runs.stopped, time.monotonic() - begun, runs.case_s, runs.most,
+        tuple(executor.notes),
+    )  # fmt: skip
+
+
+class _Runs:
+    """The course of a batch: what waits, what is under way, what has failed."""
+
+    def __init__(self, store: Store, executor: Executor, names: Sequence[str], retries: int) -> None:
+        self._store, self._executor, self._retries = store, executor, retries
+        self.waiting = deque(names)
+        self.under_way: set[str] = set()
+        self.attempts: Counter[str] = Counter()
+        self._lost: Counter[str] = Counter()
+        self.failed: dict[str, Ended] = {}
+        self.done = 0
+        self.case_s = 0.0
+        self.most = 0
+        self.stopped = ""
+
+    def steps(self) -> Iterator[None]:
+        """Begin and end cases until there is none left, or results cannot be written."""
+        while (self.waiting or self.under_way) and not self.stopped:
+            for _ in range(min(self._executor.room, len(self.waiting))):
+                name = self.waiting.popleft()
+                self.under_way.add(name)
+                self._executor.submit(self._store.task(name))
+            self.most = max(self.most, self._executor.workers)
+            for ended in self._executor.wait():
+                self._end(ended)
+            yield
+
+    def _end(self, ended: Ended) -> None:
+        name = ended.name
+        if name not in self.under_way:
+            return
+        self.under_way.discard(name)
+        self.case_s += ended.seconds
+        if ended.status == "lost":
+            self._lost[name] += 1
+            again = self._lost[name] <= LOST
+        else:
+            self.attempts[name] += 1
+            again = ended.status in ("died", "hung", "memory") and self.attempts[name] <= self._retries
+        if ended.status == "done":
+            self.done += 1
+            self.failed.pop(name, None)
+        elif again:
+            self.waiting.append(name)
+        else:
+            self.failed[name] = ended
+            if ended.status == "cannot write":
+                self.stopped = f"{ended.message}; make room, then run it again"
+
+
+class _Told:
+    """Progress with the time that is left."""
+
+    def __init__(self, before: int, total: int, progress: Progress | None) -> None:
+        self._before, self._total, self._progress = before, total, progress
+        self._begun_s = time.monotonic()
+        self._said_s = float("-inf")
+
+    def tell(self, runs: _Runs, executor: Executor) -> None:
+        """Tell how many cases are done, not more often than every SAID_S."""
+        now_s = time.monotonic()
+        over = not runs.waiting and not runs.under_way
+        if now_s - self._said_s < SAID_S and not over:
+            return
+        self._said_s = now_s
+        done = self._before + runs.done
+        ended = runs.done + len(runs.failed)
+        notes = []
+        if ended and not over:
+            left_s = (now_s - self._begun_s) / ended * (len(runs.waiting) + len(runs.under_way))
+            notes.append(f"{in_words(left_s)} left")
+        if runs.failed:
+            notes.append(f"{len(runs.failed)} failed")
+        if not executor.workers:
+            notes.append("waiting for workers")
+        tell_stage("cases", done, self._total, "done", ", ".join(notes))
+        if self._progress is not None:
+            self._progress(done, self._total)
+
+
+def in_words(seconds: float) -> str:
+    """A time, in words."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def probe(store: Store, executor: Callable[[], Executor], scratch: Store, most: int = 3) -> float:
+    """Mean wall time of a case in seconds, measured with a few cases that are spread over the batch.
+
+    scratch: a store of the same cases, in another folder. Raises UsageError if one of them fails.
+    """
+    names = list(store.cases)
+    some = list(dict.fromkeys(names[(2 * i + 1) * len(names) // (2 * most)] for i in range(most)))
+    doing = executor()
+    runs = _Runs(scratch, doing, some, 0)
+    try:
+        for _ in runs.steps():
+            tell_stage("trying cases", runs.done, len(some), "done")
+    finally:
+        doing.close()
+    if runs.failed:
+        first = next(iter(runs.failed.values()))
+        raise UsageError(f"case {first.name} fails: {first.message}")
+    return runs.case_s / len(some)

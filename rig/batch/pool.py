@@ -1,0 +1,193 @@
+"""Processes of this computer that do cases, each with one thread, limited time and limited memory.
+
+A process that dies, hangs or takes too much memory is replaced, and only its own case has failed. Sizes of memory are
+watched on Linux alone.
+"""
+
+import contextlib
+import json
+import os
+import selectors
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+from drivers.cores import VARIABLE, cores
+from rig.batch.task import Ended, Status, Task
+
+LOOK_S: Final = 0.2
+"""Seconds from one look at memory and time to the next."""
+USUAL_BYTES: Final = 2 << 30
+"""Memory of a case, if nobody says how much it needs: there are no more workers than have room for it."""
+KEPT_FREE: Final = 0.1
+"""Share of this computer's memory that is left to others."""
+TRACE: Final = 2000
+"""Bytes from the end of what a process printed that are kept if it dies."""
+ONE_THREAD: Final = {
+    name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", VARIABLE)
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits of a case: wall time in seconds, and memory in bytes (None for a fair share of this computer's)."""
+
+    time_s: float = 3600.0
+    memory_bytes: int | None = None
+
+
+def memory_bytes() -> int:
+    """This computer's memory, or the part of it that our control group may use."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
+    for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with contextlib.suppress(OSError, ValueError):
+            total = min(total, int(Path(file).read_text()))
+    return total
+
+
+def usual_workers(limits: Limits) -> int:
+    """Number of workers for which there are cores and memory; at least 1."""
+    room = int((1 - KEPT_FREE) * memory_bytes() // (limits.memory_bytes or USUAL_BYTES))
+    return max(1, min(cores(), room))
+
+
+class Pool:
+    """An executor with processes of its own; see `rig.batch.engine.Executor`."""
+
+    def __init__(self, workers: int | None = None, limits: Limits | None = None, name: str = "worker") -> None:
+        limits = limits or Limits()
+        self.workers = usual_workers(limits) if workers is None else workers
+        share = int((1 - KEPT_FREE) * memory_bytes() / self.workers)
+        self._limits = Limits(limits.time_s, limits.memory_bytes or share)
+        self.notes: list[str] = []
+        self._idle = [f"{name} {number}" for number in range(self.workers, 0, -1)]
+        self._free: list[_Process] = []
+        self._busy: list[_Process] = []
+
+    @property
+    def room(self) -> int:
+        """Number of tasks that can be begun now."""
+        return self.workers - len(self._busy)
+
+    def submit(self, task: Task) -> None:
+        """Begin a task; only if there is room."""
+        process = self._free.pop() if self._free else _Process(self._idle.pop(), self._limits)
+        self._busy.append(process)
+        process.begin(task)
+
+    def wait(self) -> list[Ended]:
+        """Tasks that have ended: empty if none does within LOOK_S."""
+        ended: list[Ended] = []
+        with selectors.DefaultSelector() as selector:
+            for process in self._busy:
+                selector.register(process.answers, selectors.EVENT_READ, process)
+            ready = {key.data for key, _ in selector.select(LOOK_S)}
+        for process in list(self._busy):
+            end = process.answer() if process in ready else process.overdrawn()
+            if end is None:
+                continue
+            ended.append(end)
+            self._busy.remove(process)
+            if process.alive:
+                self._free.append(process)
+            else:
+                self._idle.append(process.name)
+        return ended
+
+    def __del__(self) -> None:
+        """Close, since a thread of a dask worker may end without saying so."""
+        self.close()
+
+    def close(self) -> None:
+        """End all processes, also those at work."""
+        for process in [*self._busy, *self._free]:
+            process.kill()
+        self._busy.clear()
+        self._free.clear()
+
+
+class _Process:
+    """A process `rig.batch.worker`, and its present task."""
+
+    def __init__(self, name: str, limits: Limits) -> None:
+        self.name = name
+        self._limits = limits
+        self._printed: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # closed by kill
+        self._task: Task | None = None
+        self._begun_s = 0.0
+        self._part = b""
+        self.alive = True
+        path = os.pathsep.join(each or os.getcwd() for each in sys.path)
+        # A session of its own: Ctrl-C at the terminal is for the process that started this one.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "rig.batch.worker", name], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=self._printed, env={**os.environ, **ONE_THREAD, "PYTHONPATH": path}, start_new_session=True,
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._stdin, self.answers = self._process.stdin, self._process.stdout
+
+    def begin(self, task: Task) -> None:
+        """Send a task."""
+        self._task = task
+        self._begun_s = time.monotonic()
+        try:
+            self._stdin.write(task.as_line().encode())
+            self._stdin.flush()
+        except OSError:  # it has just died: `answer` finds out
+            pass
+
+    def answer(self) -> Ended | None:
+        """The end of the task, once the process has said or died; None if only a part of the line is there."""
+        data = os.read(self.answers.fileno(), 1 << 16)
+        if not data:
+            self._process.wait()
+            return self._end("died", f"the process ended with {_in_words(self._process.returncode)}")
+        self._part += data
+        if not self._part.endswith(b"\n"):
+            return None
+        line, self._part = self._part, b""
+        return Ended(**json.loads(line))
+
+    def overdrawn(self) -> Ended | None:
+        """The end of a task that has taken too long or too much memory; None if it has not."""
+        limits = self._limits
+        if time.monotonic() - self._begun_s > limits.time_s:
+            return self._end("hung", f"the case took longer than {limits.time_s:g} s")
+        assert limits.memory_bytes is not None, "the pool has set it"
+        used = resident_bytes(self._process.pid)
+        if used > limits.memory_bytes:
+            return self._end("memory", f"the case took {used / 1e9:.2g} GB, at most {limits.memory_bytes / 1e9:.2g} GB")
+        return None
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self.alive = False
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._stdin, self.answers, self._printed):
+            with contextlib.suppress(OSError):
+                stream.close()
+
+    def _end(self, status: Status, message: str) -> Ended:
+        assert self._task is not None, "a task is at work"
+        self._printed.seek(max(0, self._printed.seek(0, os.SEEK_END) - TRACE))
+        detail = self._printed.read().decode(errors="replace")
+        self.kill()
+        return Ended(self._task.name, status, message, detail, time.monotonic() - self._begun_s, self.name)
+
+
+def resident_bytes(pid: int) -> int:
+    """Memory of a process; 0 where the system does not tell."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def _in_words(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"

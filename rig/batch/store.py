@@ -1,0 +1,199 @@
+"""The folder of a batch: which cases there are, results as they come, and one table of all.
+
+    study.json       what is done, with the versions of the code
+    cases.jsonl      each case: its name, function, inputs, labels and checksums of its files
+    cases/           results that are not in the table yet, a file each
+    table.jsonl      a line for the versions, then a line for each finished case, in the order of `cases.jsonl`
+    measured.jsonl   times and the like, which differ from run to run
+    failures.jsonl   cases that failed, each with the command that repeats it
+
+The bytes of the table do not depend on how many workers there were, in which order they ended, or how often the batch
+was interrupted.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+from rig.batch.case import MEASURED, Case, checksum, code_digest, numeric_versions, package_of
+from rig.batch.task import CASE, CASES, HEAD, RESULT, Task, read_result, result_file
+from rig.errors import UsageError
+from rig.run_folder.disk import hold, replace_file, sync_folder
+from rig.run_folder.plain_json import json_line, json_text
+
+SCHEMA: Final = 1
+LIST: Final = "cases.jsonl"
+TABLE: Final = "table.jsonl"
+MEASUREMENTS: Final = "measured.jsonl"
+FAILURES: Final = "failures.jsonl"
+LOCK: Final = ".lock"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A finished case. measured: figures that differ from run to run, such as times."""
+
+    case: str
+    labels: Mapping[str, Any]
+    result: Mapping[str, Any]
+    measured: Mapping[str, Any]
+
+
+class Store:
+    """The folder of a batch, held by this process alone until `close`; with `shared`, by shards of the same batch.
+
+    title: kept with the versions. Raises UsageError if the folder has another batch, or one of another version of the
+    code, or if somebody else is at work in it.
+    """
+
+    def __init__(
+        self, folder: Path, cases: Sequence[Case], title: Mapping[str, Any] | None = None, *, shared: bool = False
+    ) -> None:
+        self.folder = folder.absolute()
+        self.checksums = sums = {
+            path: checksum(path) for path in dict.fromkeys(path for case in cases for path in case.files)
+        }
+        codes = {package: code_digest(package) for package in {package_of(case.function) for case in cases}}
+        self.cases: dict[str, Case] = {}
+        for case in cases:
+            self.cases.setdefault(case.name(codes[package_of(case.function)], sums), case)
+        self.codes = codes
+        lines = "".join(
+            json_line({CASE: name, **asdict(case), "files": {path: sums[path] for path in case.files}})
+            for name, case in self.cases.items()
+        )
+        self.head = {"schema": SCHEMA, "code": codes, "versions": numeric_versions(), **(title or {})}
+        self._lock = -1
+        try:
+            self._claim(lines, shared)
+        except OSError as error:
+            self.close()
+            raise UsageError(f"cannot write {self.folder}: {error.strerror}; name another folder as `out`") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        """The store itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Let others work in the folder."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def _claim(self, lines: str, shared: bool) -> None:
+        folder = self.folder
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"`out={folder}` is a file; name a new folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / HEAD).exists() and any(each.name != LOCK for each in folder.iterdir()):
+            raise UsageError(f"`out={folder}` has something else in it; name a new folder, or that of the same study")
+        self._lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
+        try:
+            hold(self._lock, shared=shared)
+        except OSError as error:
+            raise UsageError(f"another process is at work in {folder}; wait until it has ended") from error
+        if (folder / HEAD).exists():
+            self._require_same(lines)
+        else:
+            replace_file(folder / LIST, lines.encode())
+            replace_file(folder / HEAD, (json_text(self.head) + "\n").encode())
+        (folder / CASES).mkdir(exist_ok=True)
+
+    def _require_same(self, lines: str) -> None:
+        """Raise UsageError if the folder has been begun with other cases, or with other code."""
+        try:
+            before = json.loads((self.folder / HEAD).read_text(encoding="utf-8"))
+            listed = (self.folder / LIST).read_text(encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{self.folder} has no batch that can be read ({error}); name a new folder") from error
+        if listed == lines and before.get("code") == self.head["code"]:
+            return
+        if before.get("versions") != self.head["versions"]:
+            what = f"with other versions of packages: {before.get('versions')}, here {self.head['versions']}"
+        elif before.get("code") != self.head["code"]:
+            what = "with another version of the code"
+        else:
+            there = {each[CASE] for each in map(json.loads, listed.splitlines())}
+            what = f"with other cases: {len(there)}, of which {len(there & self.cases.keys())} are the same"
+        raise UsageError(f"{self.folder} was begun {what}; name a new folder for this one as another study")
+
+    def task(self, name: str) -> Task:
+        """A case as it is sent to a worker."""
+        case = self.cases[name]
+        return Task(name, case.function, case.inputs, self.codes[package_of(case.function)], str(self.folder))
+
+    def finished(self) -> set[str]:
+        """Names of the cases that have a result. Files that a loss of power has torn are removed."""
+        found = {row.case for row in self.rows()}
+        for file in (self.folder / CASES).glob("*/*.json"):
+            if file.stem not in found and file.stem in self.cases:
+                file.unlink(missing_ok=True)
+        return found
+
+    def rows(self) -> Iterator[Row]:
+        """All finished cases, in order."""
+        return read_rows(self.folder)
+
+    def done(self, name: str) -> bool:
+        """Whether a result of a case has been written since the last `pack`."""
+        return result_file(self.folder, name).exists()
+
+    def pack(self) -> int:
+        """Write the table with all results that there are, and return their number. Raises OSError."""
+        rows = list(self.rows())
+        table = [json_line(self.head)]
+        table += [json_line({CASE: row.case, "labels": row.labels, RESULT: row.result}) for row in rows]
+        measured = "".join(json_line({CASE: row.case, MEASURED: row.measured}) for row in rows)
+        replace_file(self.folder / MEASUREMENTS, measured.encode())
+        replace_file(self.folder / TABLE, "".join(table).encode())
+        sync_folder(self.folder)
+        packed = {row.case for row in rows}
+        for part in (self.folder / CASES).iterdir():
+            for file in part.iterdir():
+                if file.stem in packed or file.suffix == ".part":
+                    file.unlink(missing_ok=True)
+        if len(packed) == len(self.cases):
+            shutil.rmtree(self.folder / CASES, ignore_errors=True)
+        return len(packed)
+
+    def alone(self) -> bool:
+        """Whether no other shard is at work in the folder; none can begin then until `close`."""
+        try:
+            hold(self._lock)
+        except OSError:
+            return False
+        return True
+
+
+def read_rows(folder: Path) -> Iterator[Row]:
+    """All finished cases of a batch, in order. Raises UsageError if the folder has no batch."""
+    try:
+        listed = (folder / LIST).read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise UsageError(f"{folder} has no study; name the folder that `rig batch` wrote") from error
+    packed = {each[CASE]: each for each in _lines(folder / TABLE) if CASE in each}
+    measured = {each[CASE]: each[MEASURED] for each in _lines(folder / MEASUREMENTS)}
+    for line in listed:
+        case = json.loads(line)
+        name = case[CASE]
+        if name in packed:
+            yield Row(name, case["labels"], packed[name][RESULT], measured.get(name, {}))
+        elif (found := read_result(result_file(folder, name), name)) is not None:
+            yield Row(name, case["labels"], found[RESULT], found[MEASURED])
+
+
+def _lines(file: Path) -> Iterator[dict[str, Any]]:
+    if file.exists():
+        with file.open(encoding="utf-8") as stream:
+            yield from map(json.loads, stream)

@@ -1,0 +1,123 @@
+"""Does one case and writes its result, on whatever computer it is. Only its name and how it ended are sent back.
+
+A result is a small file that appears whole and only once, whoever writes it first. So nothing is lost with a worker,
+and a case that was begun twice, because a connection broke, is in the table once.
+"""
+
+import errno
+import json
+import os
+import secrets
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from rig.batch.case import MEASURED, call, code_digest, package_of
+from rig.run_folder.plain_json import json_line
+
+CASES: Final = "cases"
+"""Folder of the results that are not in the table yet."""
+HEAD: Final = "study.json"
+CASE: Final = "case"
+RESULT: Final = "result"
+
+Status = Literal["done", "raised", "died", "hung", "memory", "cannot write", "other code", "no folder", "lost"]
+"""How a case ended. died: its process ended; hung: it took too long; memory: it took too much; other code, no folder:
+the worker has another version of the code, or does not see the folder; lost: the connection to the worker broke."""
+
+_NO_SPACE: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOENT, errno.EIO}
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have."""
+
+    name: str
+    function: str
+    inputs: Mapping[str, Any]
+    code: str
+    folder: str
+
+    def as_line(self) -> str:
+        """The task as a line of JSON."""
+        return json_line(asdict(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a task ended. message: one line. detail: the trace of an error. seconds: wall time of the case."""
+
+    name: str
+    status: Status
+    message: str = ""
+    detail: str = ""
+    seconds: float = 0.0
+    worker: str = ""
+
+
+def perform(task: Task, worker: str = "") -> Ended:
+    """Do a task whose result is not there yet, and write it. worker: its name, for the record."""
+    folder = Path(task.folder)
+    if not (folder / HEAD).exists():
+        return Ended(task.name, "no folder", f"{folder} is not there; share it under the same path", worker=worker)
+    if code_digest(package_of(task.function)) != task.code:
+        return Ended(task.name, "other code", "another version of the code is installed", worker=worker)
+    file = result_file(folder, task.name)
+    if file.exists():
+        return Ended(task.name, "done", worker=worker)
+    begun = time.monotonic()
+    try:
+        result = dict(call(task.function, task.inputs))
+    except MemoryError:
+        return Ended(task.name, "memory", "the case ran out of memory", traceback.format_exc(), worker=worker)
+    except Exception as error:
+        said = " ".join(str(error).split()) or "no message"
+        message = f"{type(error).__name__}: {said}"
+        return Ended(task.name, "raised", message, traceback.format_exc(), time.monotonic() - begun, worker)
+    seconds = time.monotonic() - begun
+    measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
+    try:
+        write_once(file, json_line({CASE: task.name, RESULT: result, MEASURED: measured}))
+    except OSError as error:
+        if error.errno not in _NO_SPACE:
+            raise
+        said = f"cannot write {file}: {error.strerror}"
+        return Ended(task.name, "cannot write", said, seconds=seconds, worker=worker)
+    return Ended(task.name, "done", seconds=seconds, worker=worker)
+
+
+def result_file(folder: Path, name: str) -> Path:
+    """The file of a case's result: 256 folders, since some file systems are slow with folders of very many files."""
+    return folder / CASES / name[:2] / f"{name}.json"
+
+
+def write_once(file: Path, text: str) -> None:
+    """Write a file that appears whole, unless it is there already. Raises OSError."""
+    file.parent.mkdir(exist_ok=True)
+    scratch = file.with_name(f".{file.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    try:
+        scratch.write_text(text, encoding="utf-8")
+        try:
+            os.link(scratch, file)
+        except FileExistsError:
+            pass
+        except OSError as error:
+            if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EMLINK):
+                raise
+            scratch.replace(file)  # a file system without links; the same result may be written over itself
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def read_result(file: Path, name: str) -> dict[str, Any] | None:
+    """A result as it was written; None if it was torn by a loss of power."""
+    try:
+        text = file.read_text(encoding="utf-8")
+        content = json.loads(text)
+    except (OSError, ValueError):
+        return None
+    whole = text.endswith("\n") and isinstance(content, dict) and content.get(CASE) == name
+    return content if whole else None

@@ -1,0 +1,36 @@
+"""Writes values of any kind as strict JSON."""
+
+import json
+import math
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Content as strict JSON. NaN and infinity become null, arrays lists, fractions numbers, and all else text."""
+    return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def json_line(content: Mapping[str, Any]) -> str:
+    """The same on one line, with its end. Keys are sorted, so that the same content is always the same line."""
+    return json.dumps(plain(content), sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """A value made of what JSON has; see `json_text`."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, Fraction):
+        return plain(float(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    return str(value)

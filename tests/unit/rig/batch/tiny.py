@@ -1,0 +1,32 @@
+"""Cases for tests: quick ones, and such that end badly."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+
+def square(x: int, sleep_s: float = 0.0) -> dict[str, Any]:
+    """A case that always ends well."""
+    time.sleep(sleep_s)
+    return {"y": x * x, "measured": {"pid": os.getpid()}}
+
+
+def trouble(x: int, kind: str, counter: str, times: int = 10**9) -> dict[str, Any]:
+    """A case that ends badly as often as `times` says, counted by files in the folder `counter`."""
+    before = len(list(Path(counter).glob(f"{x}-*")))
+    (Path(counter) / f"{x}-{before}").touch()
+    if before < times:
+        if kind == "raise":
+            raise ValueError(f"no {x}\nsecond line")
+        if kind == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if kind == "hang":
+            time.sleep(1000)
+        if kind == "eat":
+            eaten = []
+            while True:
+                eaten.append(bytearray(20 << 20))
+                time.sleep(0.01)
+    return {"y": x * x}
