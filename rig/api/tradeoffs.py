@@ -32,7 +32,7 @@ def tradeoff(
     request, changes: options, as a `TradeoffRequest` or by the names of its fields:
       `tradeoff(exposures=(1, 3), time_budget="20 ms")`. The calibration is checked once, against the rig with as many
       lines as its config names.
-    progress: called with the number of frames done and the total.
+    progress: called with the number of scans done and of all.
 
     Raises UsageError, one line per problem. An interrupt ends the trials after the last complete row, with verdict
     'aborted'.

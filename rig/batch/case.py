@@ -30,6 +30,9 @@ NUMERIC_PACKAGES: Final = "numpy", "numba", "opencv-contrib-python-headless"
 MEASURED: Final = "measured"
 NAME_DIGITS: Final = 24
 
+Result = Mapping[str, Any]
+"""What the function of a case returns."""
+
 
 @dataclass(frozen=True, slots=True)
 class Case:
@@ -44,7 +47,7 @@ class Case:
     labels: Mapping[str, Any] = field(default_factory=dict)
     files: tuple[str, ...] = ()
 
-    def call(self) -> Mapping[str, Any]:
+    def call(self) -> Result:
         """The result, computed here and now. Raises what the function raises."""
         return call(self.function, self.inputs)
 
@@ -55,7 +58,7 @@ class Case:
         return hashlib.sha256(json_line(made_of).encode()).hexdigest()[:NAME_DIGITS]
 
 
-def call(function: str, inputs: Mapping[str, Any]) -> Mapping[str, Any]:
+def call(function: str, inputs: Mapping[str, Any]) -> Result:
     """Call a function by its name, 'package.module:name'. Raises TypeError if it returns no mapping."""
     module, _, name = function.partition(":")
     result = getattr(import_module(module), name)(**inputs)

@@ -7,7 +7,7 @@ that the plan uses are kept, as with a SPAD that sends windows. Begin reading at
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import product
@@ -25,9 +25,7 @@ from rig.errors import UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import WORD_PX
-from rig.requests import TradeoffRequest
 from rig.scan.acquisition import Acquisition, AcquisitionRequest
-from rig.scan.monitor import Listeners
 from rig.scan.scan import make_reconstructor
 from rig.tradeoff.rows import Place, TradeoffRow, TrialSetting, score_map
 
@@ -153,24 +151,20 @@ class ManyMakers:
 
 
 def score_methods(
-    config: RigConfig, place: Place, asked: TradeoffRequest, seed: int, tell: Callable[[float], None]
+    config: RigConfig, place: Place, estimators: Sequence[str], filters: Sequence[str], seed: int
 ) -> list[TradeoffRow]:
-    """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames.
-
-    tell: called with the share of the frames that are done.
-    """
+    """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames."""
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
         plan, timing = prepare(rig)
-        for method in product(asked.estimators, asked.filters):
+        for method in product(estimators, filters):
             warm_up(*method, plan.exposures, dark=True)
         warm_binding(plan)
         estimate = rig.config.estimate
-        settings = {name: estimate.model_copy(update={"estimator": name}) for name in asked.estimators}
+        settings = {name: estimate.model_copy(update={"estimator": name}) for name in estimators}
         makers = {name: make_reconstructor(rig, plan, each) for name, each in settings.items()}
-        maker = ManyMakers(makers, asked.filters)
-        listeners = Listeners(live=lambda now: tell(now.frames / max(now.frames_planned, 1)))
-        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(asked.estimators), listeners=listeners)
+        maker = ManyMakers(makers, filters)
+        request = AcquisitionRequest(maps=MAPS, learns=not LEARNING.isdisjoint(estimators))
         running = Acquisition(rig, plan, timing, maker, request).run()
         with closing(running):
             last = [found for found in running][-1]

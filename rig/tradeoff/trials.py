@@ -1,12 +1,14 @@
 """Scans a simulated rig over settings and scores the maps by the world's truth, to show what accuracy costs in time."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import count, product, starmap
+from itertools import product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from rig.batch.case import Case, Result
 from rig.config.estimators import estimator_names
+from rig.config.files import portable_content
 from rig.config.models import AUTO, RigConfig
 from rig.config.overrides import Config, configure, with_lines
 from rig.errors import each_or_problems
@@ -15,8 +17,8 @@ from rig.progress import Progress, part, tell_stage
 from rig.requests import TradeoffRequest
 from rig.tradeoff.choice import Choice, Wish, advice, choose
 from rig.tradeoff.limits import SceneLimits
-from rig.tradeoff.rows import TradeoffRow, over_repeats, with_fronts
-from rig.tradeoff.scan import MAPS, require_plan, score_methods
+from rig.tradeoff.rows import Place, TradeoffRow, over_repeats, with_fronts
+from rig.tradeoff.scan import require_plan, score_methods
 
 
 class Trial(NamedTuple):
@@ -90,24 +92,51 @@ class Tradeoff:
         return {**content, "verdict": self.verdict}
 
 
-def run_tradeoff(
-    trials: Trials, asked: TradeoffRequest, wish: Wish | None, progress: Progress | None = None
+def cases_of(trials: Trials, asked: TradeoffRequest) -> list[Case]:
+    """A case for each repeat of each trial, with at least one estimator and filter: trial by trial, seed by seed."""
+    cases = []
+    for trial, config in trials.items():
+        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
+        setting = {"scene": scene, "fog": trial.fog, "exposures": trial.exposures, "lines": len(config.line_offsets)}
+        content = portable_content(config)
+        inputs = {"config": content, "place": [scene, trial.fog], "methods": [asked.estimators, asked.filters]}
+        files = tuple(path for path in (content.get("calibration"), scene) if path and Path(path).exists())
+        for seed in range(asked.seed, asked.seed + asked.repeat):
+            cases.append(Case(f"{__name__}:scan_once", {**inputs, "seed": seed}, {**setting, "seed": seed}, files))
+    return cases
+
+
+def scan_once(
+    config: Mapping[str, Any], place: Place, methods: tuple[Sequence[str], Sequence[str]], seed: int
+) -> dict[str, Any]:
+    """One scan as a case: rows of all estimators and filters as plain values, with the times that they took apart."""
+    rows = score_methods(RigConfig.model_validate(config), (place[0], place[1]), *methods, seed)
+    return {
+        "rows": [{**asdict(row), "compute_ms": None} for row in rows],
+        "measured": {"compute_ms": [row.compute_ms for row in rows]},
+    }
+
+
+def tabulate(
+    trials: Trials,
+    asked: TradeoffRequest,
+    wish: Wish | None,
+    found: Sequence[Result | None],
+    verdict: Literal["complete", "aborted"] = "complete",
 ) -> Tradeoff:
-    """Scan and score all trials, with at least one estimator and filter.
-
-    progress: called with the number of frames done and the total, both of frames on columns.
-
-    An interrupt ends the trade-off after the last complete row; before the first complete row it is raised again.
-    """
+    """Make the trade-off of the results of `cases_of`, as far as they go: trials with a result missing are left out."""
     rows: list[TradeoffRow] = []
-    verdict: Literal["complete", "aborted"] = "complete"
-    try:
-        for found in _rows(trials, asked, progress):
-            rows += found
-    except KeyboardInterrupt:
-        if not rows:
-            raise
-        verdict = "aborted"
+    limits = SceneLimits(asked.exposures)
+    for number, config in enumerate(trials.values()):
+        results = found[number * asked.repeat : (number + 1) * asked.repeat]
+        repeats = [rows_of(result) for result in results if result is not None]
+        if len(repeats) < asked.repeat:
+            continue
+        of_trial = list(map(over_repeats, zip(*repeats, strict=True)))
+        if asked.limits:
+            tell_stage("finding what the light allows")
+            of_trial = limits.beside(of_trial, config)
+        rows += of_trial
     done = with_fronts(rows)
     return Tradeoff(
         rows=done,
@@ -116,6 +145,40 @@ def run_tradeoff(
         answer=None if wish is None else choose(done, wish),
         verdict=verdict,
     )
+
+
+def rows_of(result: Result) -> list[TradeoffRow]:
+    """The rows in the result of `scan_once`."""
+    times_ms = result["measured"]["compute_ms"]
+    return [
+        TradeoffRow(**{**row, "ci95": tuple(row["ci95"]), "compute_ms": time_ms})
+        for row, time_ms in zip(result["rows"], times_ms, strict=True)
+    ]
+
+
+def run_tradeoff(
+    trials: Trials, asked: TradeoffRequest, wish: Wish | None, progress: Progress | None = None
+) -> Tradeoff:
+    """Scan and score all trials in this process, one after the other, so that each has the computer for itself.
+
+    progress: called with the number of scans done and of all.
+
+    An interrupt ends the trade-off after the last complete trial; before the first complete one it is raised again.
+    """
+    cases = cases_of(trials, asked)
+    found: list[Result | None] = []
+    verdict: Literal["complete", "aborted"] = "complete"
+    try:
+        for case in cases:
+            with part(f"scan {len(found) + 1} of {len(cases)}"):
+                found.append(case.call())
+            if progress is not None:
+                progress(len(found), len(cases))
+    except KeyboardInterrupt:
+        if len(found) < asked.repeat:
+            raise
+        verdict = "aborted"
+    return tabulate(trials, asked, wish, found + [None] * (len(cases) - len(found)), verdict)
 
 
 def method_problems(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:
@@ -127,33 +190,3 @@ def method_problems(estimators: Sequence[str], filters: Sequence[str]) -> list[s
         for name in names
         if name not in known
     ]
-
-
-def _rows(trials: Trials, asked: TradeoffRequest, progress: Progress | None) -> Iterator[list[TradeoffRow]]:
-    """Give the rows of one trial after the other."""
-    frames_of_all = asked.repeat * sum(map(_frames_of, trials.values()))
-    done = 0
-    limits = SceneLimits(asked.exposures)
-    numbers = count(1)
-
-    def tell(share: float = 0.0) -> None:
-        if progress is not None:
-            progress(round(done + share * _frames_of(config)), frames_of_all)
-
-    for trial, config in trials.items():
-        scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
-        repeats: list[list[TradeoffRow]] = []
-        for seed in range(asked.seed, asked.seed + asked.repeat):
-            with part(f"scan {next(numbers)} of {len(trials) * asked.repeat}"):
-                repeats.append(score_methods(config, (scene, trial.fog), asked, seed, tell))
-            done += _frames_of(config)
-            tell()
-        rows = list(map(over_repeats, zip(*repeats, strict=True)))
-        if asked.limits:
-            tell_stage("finding what the light allows")
-        yield limits.beside(rows, config) if asked.limits else rows
-
-
-def _frames_of(config: RigConfig) -> int:
-    """Number of frames on columns of one scan."""
-    return MAPS * config.scan.columns * config.scan.exposures // len(config.line_offsets)

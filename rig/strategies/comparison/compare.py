@@ -19,6 +19,8 @@ import numpy as np
 
 from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
+from rig.batch.case import Case, Result
+from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.config.overrides import configure
 from rig.errors import RigError, UsageError
@@ -29,7 +31,7 @@ from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
 from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
 from rig.strategies.comparison.score import Score, score, scored_pixels
-from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort
+from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort, find_strategy
 from rig.tradeoff.effects import open_world
 
 LINES: Final = 8
@@ -152,27 +154,71 @@ def run_comparison(
     verdict: Literal["complete", "aborted"] = "complete"
     total = len(ways) * len(asked.scenes) * len(asked.airs) * len(asked.times_s) * len(asked.rules)
     try:
-        with TemporaryDirectory() as made:
-            for row in _rows(config, ways, asked, Path(made)):
-                rows.append(row)
-                if progress is not None:
-                    progress(len(rows), total)
+        for row in _rows(config, ways, asked):
+            rows.append(row)
+            if progress is not None:
+                progress(len(rows), total)
     except KeyboardInterrupt:
         if not rows:
             raise
         verdict = "aborted"
-    notes = tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
-    return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
+    return _comparison(ways, rows, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan, folder: Path) -> Iterator[StrategyRow]:
+def _rows(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> Iterator[StrategyRow]:
     model = rig_model(config)
     for scene, air in product(asked.scenes, asked.airs):
         name = scene.rstrip("/").rsplit("/", 1)[-1]
-        with part(name if air is None else f"{name}, {air}"):
+        with part(name if air is None else f"{name}, {air}"), TemporaryDirectory() as made:
             tell_stage("making the scene")
-            file = scene_file(scene, air, asked.lux, model, folder)
+            file = scene_file(scene, air, asked.lux, model, Path(made))
             yield from _of_place(configure(config, scene=str(file)), model, ways, asked, (name, air))
+
+
+def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
+    """A case for each scene, air, rule and time, with all strategies."""
+    content, names = portable_content(config), [way.name for way in ways]
+    cases = []
+    for scene, air, rule, time_s in product(asked.scenes, asked.airs, asked.rules, asked.times_s):
+        there = Path(scene).exists()
+        one = replace(
+            asked, scenes=[str(Path(scene).absolute()) if there else scene], airs=[air], times_s=[time_s], rules=[rule]
+        )
+        plan = {**asdict(one), "seeds": [asked.seeds.start, asked.seeds.stop]}
+        files = tuple(path for path in (content.get("calibration"), one.scenes[0] if there else None) if path)
+        labels = {"scene": scene, "air": air, "rule": rule, "time_ms": 1e3 * time_s}
+        cases.append(Case(f"{__name__}:measure_once", {"config": content, "ways": names, "plan": plan}, labels, files))
+    return cases
+
+
+def measure_once(config: Mapping[str, Any], ways: Sequence[str], plan: Mapping[str, Any]) -> dict[str, Any]:
+    """The rows of a part of a comparison as a case: plain values, with the computing times apart."""
+    asked = ComparisonPlan(**{**plan, "seeds": range(*plan["seeds"])})
+    rows = list(_rows(RigConfig.model_validate(config), [find_strategy(name) for name in ways], asked))
+    return {
+        "rows": [{**asdict(row), "compute_s": 0.0} for row in rows],
+        "measured": {"compute_s": [row.compute_s for row in rows]},
+    }
+
+
+def tabulate(
+    ways: Sequence[Strategy], found: Sequence[Result | None], verdict: Literal["complete", "aborted"] = "complete"
+) -> Comparison:
+    """Make the comparison of the results of `cases_of`; those that are missing are left out."""
+    rows = [
+        StrategyRow(**{**row, "compute_s": compute_s})
+        for result in found
+        if result is not None
+        for row, compute_s in zip(result["rows"], result["measured"]["compute_s"], strict=True)
+    ]
+    return _comparison(ways, rows, verdict)
+
+
+def _comparison(
+    ways: Sequence[Strategy], rows: Sequence[StrategyRow], verdict: Literal["complete", "aborted"]
+) -> Comparison:
+    notes = tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
+    return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
 
 
 def _of_place(

@@ -200,7 +200,7 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     trials = trials_of("simulated", asked)
     done = iter(range(whole))
 
-    def scanned(config, place, asked, seed, tell):
+    def scanned(config, place, estimators, filters, seed):
         if next(done, None) is None:
             raise KeyboardInterrupt
         return [replace(ROW, exposures=config.scan.exposures)]
@@ -214,7 +214,7 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
     found = run_tradeoff(trials, asked, None, lambda *frames: told.append(frames))
     assert [row.exposures for row in found.rows] == [1, 3]
     assert found.verdict == found.as_json()["verdict"] == "aborted"
-    assert told == [(1000, 14000), (4000, 14000)]
+    assert told == [(1, 3), (2, 3)]
 
 
 def test_the_figure_is_sound_svg_and_shows_what_counts():
