@@ -1,0 +1,1 @@
+"""Inputs that are wrong and look right: does the depth stay right, or does the verdict say that it is not?"""
