@@ -199,6 +199,19 @@ class StrategiesRequest(TradeoffRequest):
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BatchRequest:
+    """All cases of a study, on this computer or on many (`rig batch`)."""
+
+    out: str | os.PathLike[str] | None = path_option("folder of the study: new, or to go on with", "none")
+    cluster: str | None = option(
+        None, "local (processes of this computer), tcp://HOST:PORT of a dask scheduler, or a YAML file", unset="local"
+    )
+    workers: int | None = option(None, "cases at once on this computer", unset="as cores and memory allow")
+    shard: str | None = option(None, "only a share of the cases: 3/10 is the third of ten", unset="all")
+
+
+@described
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SoakRequest:
     """A long stream at the sensor's rate, played in real time (`rig bench --soak`)."""
 

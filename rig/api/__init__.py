@@ -25,6 +25,7 @@ require_own_names()  # here too: another package `rig` may have overwritten only
 
 if TYPE_CHECKING:
     from rig.api.as_before import repeat
+    from rig.api.batches import BatchPlan, BatchResult, batch, plan_batch, repeat_case
     from rig.api.demo import Demonstration, demonstrate
     from rig.api.example import ExampleRecording, example_recording
     from rig.api.past_runs import runs
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from rig.recording.verify import verify
     from rig.requests import (
         AlignRequest,
+        BatchRequest,
         CameraRequest,
         CheckRequest,
         PixelsRequest,
@@ -70,6 +72,7 @@ if TYPE_CHECKING:
     )
     from rig.scan.on_request import RecordingSwitch
     from rig.scan.run import RunResult
+    from rig.study.definition import Study
     from rig.tradeoff.effects import flux_row
     from rig.tradeoff.effects import scene_effects as effects
 
@@ -77,6 +80,9 @@ __all__ = [
     "MAX_SEED",
     "SIMULATED",
     "AlignRequest",
+    "BatchPlan",
+    "BatchRequest",
+    "BatchResult",
     "CameraRequest",
     "CheckRequest",
     "Config",
@@ -97,9 +103,11 @@ __all__ = [
     "SeenMap",
     "SoakRequest",
     "StrategiesRequest",
+    "Study",
     "SyncRequest",
     "TradeoffRequest",
     "align",
+    "batch",
     "bench",
     "bundled_rigs",
     "bundled_scenes",
@@ -122,6 +130,7 @@ __all__ = [
     "flux_row",
     "import_frames",
     "laser_off",
+    "plan_batch",
     "plan_scan",
     "plan_text",
     "quality",
@@ -130,6 +139,7 @@ __all__ = [
     "recording_info",
     "repair",
     "repeat",
+    "repeat_case",
     "replay",
     "report",
     "runs",
@@ -142,6 +152,7 @@ __all__ = [
 
 _HOMES: Final = {
     "rig.api.as_before": ("repeat",),
+    "rig.api.batches": ("BatchPlan", "BatchResult", "batch", "plan_batch", "repeat_case"),
     "rig.api.demo": ("Demonstration", "demonstrate"),
     "rig.api.example": ("ExampleRecording", "example_recording"),
     "rig.api.region_quality": ("quality",),
@@ -172,6 +183,7 @@ _HOMES: Final = {
     "rig.recording.verify": ("verify",),
     "rig.requests": (
         "AlignRequest",
+        "BatchRequest",
         "CameraRequest",
         "CheckRequest",
         "PixelsRequest",
@@ -187,6 +199,7 @@ _HOMES: Final = {
     ),
     "rig.scan.on_request": ("RecordingSwitch",),
     "rig.scan.run": ("RunResult",),
+    "rig.study.definition": ("Study",),
     "rig.tradeoff.effects": ("flux_row", "scene_effects"),
 }
 """Names by the module that has them: the imports above once more, for a running program."""

@@ -5,16 +5,26 @@ from dataclasses import fields, replace
 from typing import Any, Final, cast
 
 from drivers.units import parse_quantity
+from rig.api.tradeoffs import WriteResults
+from rig.batch.case import Case, Result
+from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.errors import UsageError, each_or_problems, noted
 from rig.progress import Progress
 from rig.requests import StrategiesRequest, TradeoffRequest
 from rig.run_folder.folder import RunFolder
 from rig.strategies.apparatus import Rule
-from rig.strategies.comparison.compare import LINES, Comparison, ComparisonPlan, run_comparison
+from rig.strategies.comparison.compare import (
+    LINES,
+    Comparison,
+    ComparisonPlan,
+    cases_of,
+    run_comparison,
+    tabulate,
+)
 from rig.strategies.comparison.files import write_files
 from rig.strategies.comparison.places import OWN, air_problems
-from rig.strategies.strategy import find_strategy, strategy_names
+from rig.strategies.strategy import Strategy, find_strategy, strategy_names
 
 ALL: Final = "all"
 AIRS: Final = ("clear", "50m", "20m", "10m", "rain", "snow")
@@ -46,6 +56,29 @@ def compare_strategies(
     'aborted'.
     """
     request = replace(request or StrategiesRequest(), **changes)
+    loaded, ways, asked = _prepared(config, request)
+    if request.out is None:
+        return run_comparison(loaded, ways, asked, progress)
+    with RunFolder(request.out) as folder:
+        return write_files(folder, run_comparison(loaded, ways, asked, progress))
+
+
+def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:
+    """The measurements of a comparison as cases, and a function that writes the comparison of their results.
+
+    The function takes None for a result that is missing. Raises UsageError as `compare_strategies` does.
+    """
+    loaded, ways, asked = _prepared(config, request)
+
+    def write(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
+        done = tabulate(ways, found, "aborted" if aborted else "complete")
+        return write_files(folder, done) if done.rows else None
+
+    return cases_of(loaded, ways, asked), write
+
+
+def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, list[Strategy], ComparisonPlan]:
+    """Check a request. Raises UsageError with all problems."""
     loaded = configure(config)
     names = list(dict.fromkeys(request.strategies)) or [ALL]
     problems = _of_rig_and_request(loaded, request)
@@ -73,10 +106,7 @@ def compare_strategies(
     scenes = _once(request.scenes) or SCENES
     own = tuple(None if air == OWN else air for air in airs)
     asked = ComparisonPlan(scenes, own, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
-    if request.out is None:
-        return run_comparison(loaded, ways, asked, progress)
-    with RunFolder(request.out) as folder:
-        return write_files(folder, run_comparison(loaded, ways, asked, progress))
+    return loaded, ways, asked
 
 
 def _once(given: Sequence[str]) -> tuple[str, ...]:

@@ -1,8 +1,10 @@
 """The call that tries settings on a simulated rig: `tradeoff`."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
+from rig.batch.case import Case, Result
 from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.devices.calibration_use import accepted_by, calibration_use
@@ -12,10 +14,21 @@ from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.progress import Progress
 from rig.requests import TradeoffRequest
 from rig.run_folder.folder import RunFolder
-from rig.tradeoff.choice import wish_of
+from rig.tradeoff.choice import Wish, wish_of
 from rig.tradeoff.files import write_files
-from rig.tradeoff.trials import Tradeoff, method_problems, run_tradeoff, trials_of
+from rig.tradeoff.trials import (
+    Tradeoff,
+    Trial,
+    Trials,
+    cases_of,
+    method_problems,
+    run_tradeoff,
+    tabulate,
+    trials_of,
+)
 
+WriteResults = Callable[[RunFolder, list[Result | None], bool], object]
+"""Writes what is made of the results of cases, None for those that are missing; the bool: whether they were aborted."""
 EXPOSURES = (1, 3, 10)
 """Exposures per column that are tried if the caller names none."""
 
@@ -38,6 +51,56 @@ def tradeoff(
     'aborted'.
     """
     request = replace(request or TradeoffRequest(), **changes)
+    ready = _prepared(config, request)
+
+    def run() -> Tradeoff:
+        done = run_tradeoff(ready.trials, ready.request, ready.wish, progress)
+        return replace(done, accepted_calibration=ready.accepted)
+
+    if request.out is None:
+        return run()
+    with RunFolder(request.out) as folder:
+        return ready.write(folder, run())
+
+
+def as_cases(config: Config, request: TradeoffRequest) -> tuple[list[Case], WriteResults]:
+    """The scans of a trade-off as cases, and a function that writes the trade-off of their results into a folder.
+
+    The function takes None for a result that is missing. Raises UsageError as `tradeoff` does.
+    """
+    ready = _prepared(config, request)
+
+    def write(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
+        done = tabulate(ready.trials, ready.request, ready.wish, found, "aborted" if aborted else "complete")
+        return ready.write(folder, replace(done, accepted_calibration=ready.accepted)) if done.rows else None
+
+    return cases_of(ready.trials, ready.request), write
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """A checked request, with its usual values filled in. first: the first trial, on the config's own lines."""
+
+    config: Config
+    request: TradeoffRequest
+    wish: Wish | None
+    trials: Trials
+    first: Trial
+    accepted: tuple[str, ...]
+
+    def write(self, folder: RunFolder, done: Tradeoff) -> Tradeoff:
+        """Write everything, with the chosen setting as a config."""
+        chosen = None
+        if done.answer is not None and done.answer.fits:
+            setting = done.answer.setting
+            lines = setting.lines if self.request.lines else None
+            chosen = self.first._replace(exposures=setting.exposures, lines=lines).config(self.config)
+            chosen = configure(chosen, estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
+        return write_files(folder, done, chosen)
+
+
+def _prepared(config: Config, request: TradeoffRequest) -> _Prepared:
+    """Check a request. Raises UsageError with all problems."""
     loaded = configure(config)
     problems = _of_rig(loaded)
     request = replace(
@@ -67,21 +130,7 @@ def tradeoff(
     first = next(iter(trials))._replace(lines=None)
     with open_rig(first.config(config)) as rig:
         accepted = accepted_by(calibration_use(rig, accept=request.accept_calibration))
-
-    def run() -> Tradeoff:
-        return replace(run_tradeoff(trials, request, wish, progress), accepted_calibration=accepted)
-
-    if request.out is None:
-        return run()
-    with RunFolder(request.out) as folder:
-        done = run()
-        chosen = None
-        if done.answer is not None and done.answer.fits:
-            setting = done.answer.setting
-            lines = setting.lines if request.lines else None
-            chosen = first._replace(exposures=setting.exposures, lines=lines).config(config)
-            chosen = configure(chosen, estimator=setting.estimator, filter=setting.filter)  # type: ignore[arg-type]
-        return write_files(folder, done, chosen)
+    return _Prepared(config, request, wish, trials, first, accepted)
 
 
 def _of_rig(config: RigConfig) -> list[str]:

@@ -40,12 +40,14 @@ class Case:
 
     function: 'package.module:name'. inputs: plain values, passed as keyword arguments. labels: what tells this case
     from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
+    keeps: whether it writes files of its own, into a folder that it gets as the input `keep`.
     """
 
     function: str
     inputs: Mapping[str, Any]
     labels: Mapping[str, Any] = field(default_factory=dict)
     files: tuple[str, ...] = ()
+    keeps: bool = False
 
     def call(self) -> Result:
         """The result, computed here and now. Raises what the function raises."""

@@ -5,9 +5,10 @@ is written with all results that there are.
 """
 
 import contextlib
+import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, Protocol
 
@@ -146,7 +147,7 @@ def run_batch(
     else:
         verdict = "complete" if done == total else "part"
     return Batch(
-        done, total, runs.done, failures, verdict, runs.stopped, time.monotonic() - begun, runs.case_s, runs.most,
+        done, total, runs.done, failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s), runs.most,
         tuple(executor.notes),
     )  # fmt: skip
 
@@ -162,7 +163,7 @@ class _Runs:
         self._lost: Counter[str] = Counter()
         self.failed: dict[str, Ended] = {}
         self.done = 0
-        self.case_s = 0.0
+        self.times_s: list[float] = []
         self.most = 0
         self.stopped = ""
 
@@ -183,7 +184,7 @@ class _Runs:
         if name not in self.under_way:
             return
         self.under_way.discard(name)
-        self.case_s += ended.seconds
+        self.times_s.append(ended.seconds)
         if ended.status == "lost":
             self._lost[name] += 1
             again = self._lost[name] <= LOST
@@ -238,21 +239,21 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
-def probe(store: Store, executor: Callable[[], Executor], scratch: Store, most: int = 3) -> float:
+def probe(scratch: Store, executor: Executor, most: int = 3) -> float:
     """Mean wall time of a case in seconds, measured with a few cases that are spread over the batch.
 
-    scratch: a store of the same cases, in another folder. Raises UsageError if one of them fails.
+    scratch: a store of all cases, in a folder that nobody needs. Raises UsageError if one of them fails.
     """
-    names = list(store.cases)
+    names = list(scratch.cases)
     some = list(dict.fromkeys(names[(2 * i + 1) * len(names) // (2 * most)] for i in range(most)))
-    doing = executor()
-    runs = _Runs(scratch, doing, some, 0)
+    runs = _Runs(scratch, executor, some, 0)
     try:
         for _ in runs.steps():
             tell_stage("trying cases", runs.done, len(some), "done")
     finally:
-        doing.close()
+        executor.close()
     if runs.failed:
         first = next(iter(runs.failed.values()))
         raise UsageError(f"case {first.name} fails: {first.message}")
-    return runs.case_s / len(some)
+    times_s = runs.times_s[1:] or runs.times_s  # in the first one the process loads compiled code
+    return statistics.fmean(times_s)

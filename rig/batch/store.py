@@ -5,6 +5,7 @@
     cases/           results that are not in the table yet, a file each
     table.jsonl      a line for the versions, then a line for each finished case, in the order of `cases.jsonl`
     measured.jsonl   times and the like, which differ from run to run
+    files/           files of the cases that keep some, a folder each
     failures.jsonl   cases that failed, each with the command that repeats it
 
 The bytes of the table do not depend on how many workers there were, in which order they ended, or how often the batch
@@ -46,7 +47,8 @@ class Row:
 class Store:
     """The folder of a batch, held by this process alone until `close`; with `shared`, by shards of the same batch.
 
-    title: kept with the versions. Raises UsageError if the folder has another batch, or one of another version of the
+    cases: by name; the same case twice is done once. names: of the given cases, in their order. title: kept with the
+    versions. Raises UsageError if the folder has another batch, or one of another version of the
     code, or if somebody else is at work in it.
     """
 
@@ -58,9 +60,10 @@ class Store:
             path: checksum(path) for path in dict.fromkeys(path for case in cases for path in case.files)
         }
         codes = {package: code_digest(package) for package in {package_of(case.function) for case in cases}}
+        self.names = [case.name(codes[package_of(case.function)], sums) for case in cases]
         self.cases: dict[str, Case] = {}
-        for case in cases:
-            self.cases.setdefault(case.name(codes[package_of(case.function)], sums), case)
+        for name, case in zip(self.names, cases, strict=True):
+            self.cases.setdefault(name, case)
         self.codes = codes
         lines = "".join(
             json_line({CASE: name, **asdict(case), "files": {path: sums[path] for path in case.files}})
@@ -131,7 +134,9 @@ class Store:
     def task(self, name: str) -> Task:
         """A case as it is sent to a worker."""
         case = self.cases[name]
-        return Task(name, case.function, case.inputs, self.codes[package_of(case.function)], str(self.folder))
+        return Task(
+            name, case.function, case.inputs, self.codes[package_of(case.function)], str(self.folder), case.keeps
+        )
 
     def finished(self) -> set[str]:
         """Names of the cases that have a result. Files that a loss of power has torn are removed."""
@@ -191,6 +196,11 @@ def read_rows(folder: Path) -> Iterator[Row]:
             yield Row(name, case["labels"], packed[name][RESULT], measured.get(name, {}))
         elif (found := read_result(result_file(folder, name), name)) is not None:
             yield Row(name, case["labels"], found[RESULT], found[MEASURED])
+
+
+def read_failures(folder: Path) -> list[dict[str, Any]]:
+    """The cases that failed, as `rig.batch.engine.Failure` has them: those of all shards."""
+    return [line for file in sorted(folder.glob("failures*.jsonl")) for line in _lines(file)]
 
 
 def _lines(file: Path) -> Iterator[dict[str, Any]]:

@@ -8,6 +8,7 @@ import errno
 import json
 import os
 import secrets
+import shutil
 import time
 import traceback
 from collections.abc import Mapping
@@ -20,6 +21,8 @@ from rig.run_folder.plain_json import json_line
 
 CASES: Final = "cases"
 """Folder of the results that are not in the table yet."""
+FILES: Final = "files"
+"""Folder with the files of cases that keep some, a folder each."""
 HEAD: Final = "study.json"
 CASE: Final = "case"
 RESULT: Final = "result"
@@ -33,13 +36,15 @@ _NO_SPACE: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have."""
+    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. keeps: whether the
+    case writes files of its own."""
 
     name: str
     function: str
     inputs: Mapping[str, Any]
     code: str
     folder: str
+    keeps: bool = False
 
     def as_line(self) -> str:
         """The task as a line of JSON."""
@@ -69,8 +74,12 @@ def perform(task: Task, worker: str = "") -> Ended:
     if file.exists():
         return Ended(task.name, "done", worker=worker)
     begun = time.monotonic()
+    inputs = dict(task.inputs)
+    if task.keeps:
+        inputs["keep"] = str(folder / FILES / task.name)
+        shutil.rmtree(inputs["keep"], ignore_errors=True)  # of an attempt that was interrupted
     try:
-        result = dict(call(task.function, task.inputs))
+        result = dict(call(task.function, inputs))
     except MemoryError:
         return Ended(task.name, "memory", "the case ran out of memory", traceback.format_exc(), worker=worker)
     except Exception as error:

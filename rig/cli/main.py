@@ -18,7 +18,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli import bench, calibrate, devices, recordings, scan, view
+from rig.cli import calibrate, computing, devices, recordings, scan, view
 from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -41,7 +41,7 @@ for _commands in (
     recordings.COMMANDS,
     calibrate.COMMANDS,
     devices.COMMANDS,
-    bench.COMMANDS,
+    computing.COMMANDS,
 ):
     add_commands(app, _commands)
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rig import api
-from rig.cli import bench, calibrate, devices, recordings, scan, view
+from rig.cli import calibrate, devices, recordings, scan, view
 from rig.cli.command import Commands
 from rig.cli.tables import effects_table
 from rig.scan.monitor import ScanProgress
@@ -88,7 +88,7 @@ def each_command(commands: Commands, before: str = "") -> Iterator[tuple[str, Ca
 
 
 def test_every_command_shows_its_progress_or_is_known_to_need_none() -> None:
-    modules = bench, calibrate, devices, recordings, scan, view
+    modules = calibrate, computing, devices, recordings, scan, view
     found = dict(each_command({name: given for module in modules for name, given in module_commands(module).items()}))
     assert SILENT.keys() <= found.keys()
     silent = {name for name, command in found.items() if "with progress(" not in inspect.getsource(command)}

@@ -1,0 +1,219 @@
+"""The calls that do studies, on this computer or on many: `batch`, `plan_batch`, `repeat_case`."""
+
+import os
+import shlex
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from itertools import compress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rig.api import strategies, tradeoffs
+from rig.batch.case import Case, Result
+from rig.batch.engine import Batch, Executor, probe, run_batch
+from rig.batch.pool import Limits, Pool, usual_workers
+from rig.batch.store import Row, Store
+from rig.config.overrides import SIMULATED, PathLike
+from rig.errors import UsageError
+from rig.progress import Progress
+from rig.requests import BatchRequest, StrategiesRequest, TradeoffRequest
+from rig.run_folder.disk import replace_file
+from rig.run_folder.folder import RunFolder
+from rig.study.cases import cases_of, kept_cases
+from rig.study.definition import Study, load_study
+from rig.study.tables import csv_text, lines_of, study_report
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+StudyLike = Study | PathLike | Mapping[str, Any]
+OWN_PROCESSES = "local"
+
+
+@dataclass(frozen=True, slots=True)
+class BatchResult:
+    """Result of a study. batch: what was done and what failed. folder: where the table is."""
+
+    batch: Batch
+    folder: Path
+
+    def rows(self) -> list[Row]:
+        """The finished cases, in order."""
+        from rig.batch.store import read_rows
+
+        return list(read_rows(self.folder))
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as plain values, without the rows, which are in table.jsonl."""
+        return {**asdict(self.batch), "folder": str(self.folder)}
+
+
+@dataclass(frozen=True, slots=True)
+class BatchPlan:
+    """What a study would do. cases, left: of the study, and of those that have no result yet; workers: at once, on this
+    computer; case_s: mean wall time of a case in seconds, tried with a few, with one thread; wall_s: of all that are
+    left."""
+
+    cases: int
+    left: int
+    workers: int
+    case_s: float
+    wall_s: float
+
+
+def batch(
+    study: StudyLike,
+    request: BatchRequest | None = None,
+    *,
+    client: "Client | None" = None,
+    progress: Progress | None = None,
+    **changes: Any,
+) -> BatchResult:
+    """Do all cases of a study, or go on with it where it was interrupted (`rig batch`).
+
+    study: its file, or its content as a mapping or a `Study`.
+    request, changes: options, as a `BatchRequest` or by the names of its fields; `out` is needed.
+    client: of a dask cluster of your own, which stays open; takes the place of `cluster`.
+    progress: called with the number of finished cases and of all.
+
+    Raises UsageError for a study that cannot be done, or if `out` holds another one. An interrupt ends it with the
+    verdict 'aborted'; everything that is done by then is in the table.
+    """
+    request = replace(request or BatchRequest(), **changes)
+    loaded = load_study(study)
+    shard = _shard(request.shard)
+    if request.out is None:
+        raise UsageError("a study is written into a folder; name one with `out`")
+    if request.workers is not None and request.workers < 1:
+        raise UsageError(f"`workers` is {request.workers}; it must be at least 1")
+    made = _made(loaded)
+    limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
+    folder = Path(request.out).absolute()
+    with Store(folder, made.cases, {"study": loaded.model_dump(mode="json")}, shared=shard[1] > 1) as store:
+        executor = _executor(request, store, limits, client)
+        command = f"rig batch {_named(study)} --out {shlex.quote(str(request.out))}"
+        done = run_batch(
+            store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
+        )  # fmt: skip
+        if done.verdict != "part":
+            _write_tables(store, made, done.verdict == "aborted")
+    return BatchResult(done, folder)
+
+
+def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes: Any) -> BatchPlan:
+    """Count the cases of a study and estimate how long it takes on this computer (`rig batch --dry-run`).
+
+    A few cases are done, in a folder that is removed again. Raises UsageError as `batch` does, and if one fails.
+    """
+    request = replace(request or BatchRequest(), **changes)
+    loaded = load_study(study)
+    made = _made(loaded)
+    limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
+    workers = request.workers or usual_workers(limits)
+    with ExitStack() as stack:
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-batch-")))
+        scratch = stack.enter_context(Store(place / "probe", made.cases))
+        total = len(scratch.cases)
+        left = total
+        if request.out is not None and Path(request.out).exists():
+            store = stack.enter_context(Store(Path(request.out), made.cases, {"study": loaded.model_dump(mode="json")}))
+            left -= len(store.finished())
+        case_s = probe(scratch, Pool(1, limits)) if left else 0.0
+    return BatchPlan(total, left, workers, case_s, case_s * left / workers)
+
+
+def repeat_case(study: StudyLike, name: str) -> Result:
+    """Do one case of a study here and now, and return its result (`rig batch --case NAME`). Nothing is written.
+
+    Raises UsageError if the study has no case of this name, and whatever the case raises.
+    """
+    made = _made(load_study(study))
+    with tempfile.TemporaryDirectory(prefix="spadrig-case-") as place:
+        with Store(Path(place) / "store", made.cases) as store:
+            case = store.cases.get(name)
+        if case is None:
+            raise UsageError(f"the study has no case {name!r}; its names change with the study and with the code")
+        keep = {"keep": str(Path(place) / "files")} if case.keeps else {}
+        return replace(case, inputs={**case.inputs, **keep}).call()
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """Cases of a study, and what makes its own table of their results, if its action has one."""
+
+    cases: list[Case]
+    write: Callable[[RunFolder, list[Result | None], bool], object] | None = None
+    name: str = ""
+
+
+def _made(study: Study) -> _Made:
+    if study.do not in ("tradeoff", "strategies"):
+        return _Made(cases_of(study))
+    lists: dict[str, list[Any]] = {**{key: [value] for key, value in study.set.items()}, **study.vary}
+    config = lists.pop("config", [SIMULATED])
+    if len(config) != 1:
+        raise UsageError(f"{study.do} takes one config, not {len(config)}; make a study of each")
+    single: dict[str, Any] = {key: lists.pop(key)[0] for key in ("limits", "rows", "lux") if key in lists}
+    fields = {_FIELDS[key]: [*values] for key, values in lists.items()}
+    options: dict[str, Any] = {**single, **fields, "seed": study.seed, "repeat": study.repeat}
+    if study.do == "tradeoff":
+        cases, write = tradeoffs.as_cases(config[0], TradeoffRequest(**options))
+    else:
+        cases, write = strategies.as_cases(config[0], StrategiesRequest(**options))
+    kept = kept_cases(cases, study.omit)
+
+    def write_kept(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
+        there = iter(found)
+        return write(folder, [next(there) if keep else None for keep in kept], aborted)
+
+    return _Made(list(compress(cases, kept)), write_kept, study.do)
+
+
+_FIELDS = {
+    "scene": "scenes", "fog": "fogs", "exposures": "exposures", "lines": "lines", "estimator": "estimators",
+    "filter": "filters", "strategy": "strategies", "time": "times", "rule": "rules",
+}  # fmt: skip
+"""Options of trade-offs by the settings of studies."""
+
+
+def _executor(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
+    if client is None and request.cluster in (None, OWN_PROCESSES):
+        return Pool(request.workers, limits)
+    if request.workers is not None:
+        raise UsageError("`workers` is for this computer; a cluster has the workers that were started for it")
+    from rig.batch.cluster import Cluster, connect
+
+    return connect(str(request.cluster), store, limits) if client is None else Cluster(store, client, limits)
+
+
+def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
+    """Write the table, the page and, for a trade-off, its own files. Old ones are replaced."""
+    rows = list(store.rows())
+    if not rows:
+        return
+    replace_file(store.folder / "table.csv", csv_text(lines_of(rows)[0]).encode())
+    replace_file(store.folder / "report.html", study_report(store.folder).encode())
+    if made.write is not None:
+        results = {row.case: {**row.result, "measured": row.measured} for row in rows}
+        found: list[Result | None] = [results.get(name) for name in store.names]
+        place = store.folder / made.name
+        shutil.rmtree(place, ignore_errors=True)
+        with RunFolder(place) as folder:
+            made.write(folder, found, aborted)
+
+
+def _named(study: StudyLike) -> str:
+    return shlex.quote(os.fspath(study)) if isinstance(study, str | os.PathLike) else "STUDY.yaml"
+
+
+def _shard(text: str | None) -> tuple[int, int]:
+    """(i, n) of '3/10', i from 0. Raises UsageError."""
+    if text is None:
+        return 0, 1
+    first, _, last = text.partition("/")
+    if not (first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last)):
+        raise UsageError(f"`shard` is {text!r}; write the number of this shard and of all, such as 3/10")
+    return int(first) - 1, int(last)

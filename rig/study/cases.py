@@ -1,0 +1,115 @@
+"""Makes the cases of a study. Everything that can be wrong with a setting is found here, before any case is done."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rig.batch.case import Case
+from rig.config.estimators import estimator_names
+from rig.config.files import load_config, portable_content
+from rig.config.models import AUTO, RigConfig
+from rig.config.overrides import SIMULATED
+from rig.devices.open import open_rig
+from rig.devices.prepare import prepare
+from rig.errors import UsageError, noted
+from rig.estimate.registry import FILTERS
+from rig.study.definition import Setting, Study, left_out
+
+ACTIONS: Final = "rig.api.batch_cases"
+_KEY_OF: Final = {
+    "scene": "world.scene",
+    "fog": "world.fog",
+    "exposures": "scan.exposures",
+    "estimator": "estimate.estimator",
+    "filter": "estimate.filter",
+    "min_confidence": "estimate.min_confidence",
+    "temporal_prior": "estimate.temporal_prior",
+}
+"""Keys of the config by the short names of settings."""
+
+
+def cases_of(study: Study) -> list[Case]:
+    """The cases of a study whose action is done case by case. Raises UsageError with the problems of all settings."""
+    cases: list[Case] = []
+    problems: list[str] = []
+    for setting in study.combinations():
+        with noted(problems):
+            made = _reconstruct(study, setting) if study.do == "reconstruct" else _of_rig(study, setting)
+            told = {key: setting[key] for key in study.labels if key in setting}
+            seeds = study.seeds if study.do != "reconstruct" else study.seeds[:1]  # nothing in it is drawn
+            for seed in seeds:
+                seeded = {} if study.do == "reconstruct" else {"seed": seed}
+                inputs, labels = {**made.inputs, **seeded}, {**told, **seeded}
+                cases.append(Case(f"{ACTIONS}:{study.do}_once", inputs, labels, made.files, keeps=study.keep))
+    if problems:
+        raise UsageError.of(problems)
+    if not cases:
+        raise UsageError("the study has no case: `omit` leaves all of them out")
+    return cases
+
+
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    inputs: Mapping[str, Any]
+    files: tuple[str, ...]
+
+
+def _of_rig(study: Study, setting: Setting) -> _Inputs:
+    """A scan or a calibration of a simulated rig."""
+    overrides = {_KEY_OF.get(key, key): value for key, value in setting.items() if key not in ("config", *_COUNTS)}
+    config = load_config(str(setting.get("config", SIMULATED)), overrides)
+    require_simulated(config)
+    with open_rig(config) as rig:  # opened to hold the plan against the limits of the devices
+        prepare(rig)
+    content = portable_content(config)
+    name, usual = ("maps", 1) if study.do == "scan" else ("poses", 12)
+    count = setting.get(name, usual)
+    if not isinstance(count, int) or count < 1:
+        raise UsageError(f"{name} is {count!r}; it must be a whole number, at least 1")
+    return _Inputs({"config": content, name: count}, files_of(content))
+
+
+_COUNTS: Final = "maps", "poses"
+
+
+def _reconstruct(study: Study, setting: Setting) -> _Inputs:
+    if "recording" not in setting:
+        raise UsageError("reconstruct needs the setting `recording`, the folder of a run or an .npy of frames")
+    problems = []
+    files = tuple(str(Path(setting[key]).absolute()) for key in ("recording", "plan", "calibration") if key in setting)
+    problems += [f"{file} does not exist; correct the path" for file in files if not Path(file).exists()]
+    estimator, filter = setting.get("estimator"), setting.get("filter")
+    if estimator == AUTO:
+        problems.append(f"estimator {AUTO!r} depends on the computer; name one, so that the result does not")
+    elif estimator is not None and estimator not in estimator_names():
+        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(estimator_names())}")
+    if filter is not None and filter not in FILTERS:
+        problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+    if problems:
+        raise UsageError.of(problems)
+    paths = {key: str(Path(value).absolute()) for key, value in setting.items() if key in _FILES}
+    return _Inputs({**setting, **paths}, files)
+
+
+_FILES: Final = "recording", "plan", "calibration"
+
+
+def require_simulated(config: RigConfig) -> None:
+    """Raise UsageError unless a rig is simulated, as fast as it can be: a case must not depend on the time of day."""
+    if config.world is None:
+        raise UsageError(f"{config.name} is a real rig, and cases are done on any computer; name a simulated one")
+    if config.world.real_time:
+        raise UsageError(f"{config.name} runs in the host's time; name a rig that does not, such as {SIMULATED!r}")
+
+
+def files_of(content: Mapping[str, Any]) -> tuple[str, ...]:
+    """Paths of the files that a config refers to: its calibration, the scene, a learned state."""
+    world, estimate = content.get("world") or {}, content.get("estimate") or {}
+    paths = [content.get("calibration"), world.get("scene"), estimate.get("learned")]
+    return tuple(path for path in paths if isinstance(path, str) and Path(path).is_absolute() and Path(path).exists())
+
+
+def kept_cases(cases: Sequence[Case], omit: Sequence[Mapping[str, Any]]) -> list[bool]:
+    """For each case, whether its labels keep it in the study."""
+    return [not left_out(case.labels, omit) for case in cases]

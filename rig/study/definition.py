@@ -1,0 +1,186 @@
+"""What a study is: the content of its YAML file, and the combinations of settings that it names."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from calibration.errors import FileError
+from calibration.files.sections import load_yaml
+from rig.config.overrides import MAX_SEED, PathLike
+from rig.errors import UsageError
+
+Action = Literal["scan", "reconstruct", "tradeoff", "strategies", "calibrate"]
+Setting = dict[str, Any]
+
+_OF_RIG: Final = ("config", "scene", "fog", "exposures", "estimator", "filter", "min_confidence", "temporal_prior")
+KEYS: Final[Mapping[Action, tuple[str, ...]]] = {
+    "scan": (*_OF_RIG, "maps"),
+    "reconstruct": ("recording", "plan", "calibration", "estimator", "filter", "min_confidence"),
+    "tradeoff": ("config", "scene", "fog", "exposures", "lines", "estimator", "filter", "limits"),
+    "strategies": ("config", "scene", "fog", "strategy", "time", "rule", "rows", "lux"),
+    "calibrate": ("config", "scene", "exposures", "poses"),
+}
+"""Settings of each action. Those that simulate a rig take keys of its config too: `scan.columns`."""
+WHOLE: Final[tuple[Action, ...]] = ("tradeoff", "strategies")
+"""Actions whose lists are all combined in one table of their own."""
+PATHS: Final = "config", "scene", "recording", "plan", "calibration"
+SIZES: Final = {"MB": 1e6, "GB": 1e9}
+TIMES_S: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
+_AMOUNT: Final = re.compile(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", re.ASCII)
+MOST_CASES: Final = 1_000_000
+
+
+class Study(BaseModel):
+    """A study, as in its YAML file.
+
+    do: what is done in each case. vary: lists by setting; every combination is a case. also: further cases, each with
+    its own settings. set: settings that hold for all cases. omit: a combination that has all settings of one of these
+    is left out. repeat, seed: each is done with seeds seed, seed + 1, ... keep: whether each case keeps its files, such
+    as depth maps. time_limit, memory_limit: of a case. retries: how often a case is done again if its process died.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    do: Action
+    vary: dict[str, Annotated[list[Any], Field(min_length=1)]] = {}
+    also: list[Setting] = []
+    set: Setting = {}
+    omit: list[Annotated[Setting, Field(min_length=1)]] = []
+    repeat: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0, le=MAX_SEED - 1_000_000)
+    keep: bool = False
+    time_limit: str = "1 h"
+    memory_limit: str = "2 GB"
+    retries: int = Field(default=2, ge=0)
+
+    @field_validator("time_limit")
+    @classmethod
+    def _time(cls, text: str) -> str:
+        if not _amount(text, TIMES_S):
+            raise ValueError(f"{text!r} is no time for a case; write it like '90 s', '10 min' or '2 h'")
+        return text
+
+    @field_validator("memory_limit")
+    @classmethod
+    def _memory(cls, text: str) -> str:
+        if not _amount(text, SIZES):
+            raise ValueError(f"{text!r} is no size of memory; write it like '2 GB' or '500 MB'")
+        return text
+
+    @property
+    def time_limit_s(self) -> float:
+        """Longest wall time of a case in seconds."""
+        return _amount(self.time_limit, TIMES_S)
+
+    @property
+    def memory_limit_bytes(self) -> int:
+        """Most memory of a case."""
+        return int(_amount(self.memory_limit, SIZES))
+
+    @property
+    def seeds(self) -> range:
+        """The seeds of every combination."""
+        return range(self.seed, self.seed + self.repeat)
+
+    def combinations(self) -> Iterator[Setting]:
+        """The settings of every case, without its seed: the combined lists first, then `also`."""
+        lists = [[(key, value) for value in values] for key, values in self.vary.items()]
+        varied = [dict(each) for each in product(*lists)] if lists or not self.also else []
+        for one in [*varied, *self.also]:
+            setting = {**self.set, **one}
+            if not left_out(setting, self.omit):
+                yield setting
+
+    def problems(self) -> list[str]:
+        """A line for each setting that the action does not have."""
+        given = [*self.vary, *self.set, *(key for one in [*self.also, *self.omit] for key in one)]
+        known = KEYS[self.do]
+        dotted = self.do in ("scan", "calibrate")
+        problems = [
+            f"{self.do} has no setting {key!r}; it has {', '.join(known)}"
+            + (", and keys of the config such as scan.columns" if dotted else "")
+            for key in dict.fromkeys(given)
+            if key not in known and not (dotted and key.count(".") == 1)
+        ]
+        if self.do in WHOLE and self.also:
+            problems.append(f"`also` is not for {self.do}, which combines all lists; add the values to `vary`")
+        size = len(self.seeds) * len(self.also)
+        combined = len(self.seeds)
+        for values in self.vary.values():
+            combined *= len(values)
+        if size + combined > MOST_CASES:
+            problems.append(f"{size + combined} cases are too many, at most {MOST_CASES}; make several studies of it")
+        return problems
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of what tells the cases from each other."""
+        keys = [*self.vary, *(key for one in self.also for key in one)]
+        return (*dict.fromkeys(keys), "seed")
+
+
+def _amount(text: str, units: Mapping[str, float]) -> float:
+    """A number with one of these units; 0 if it is none."""
+    match = _AMOUNT.fullmatch(text)
+    return float(match[1]) * units.get(match[2], 0.0) if match else 0.0
+
+
+def left_out(setting: Mapping[str, Any], omit: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a setting has all values of one that is to be left out."""
+    return any(all(key in setting and setting[key] == value for key, value in one.items()) for one in omit)
+
+
+def load_study(study: Study | PathLike | Mapping[str, Any]) -> Study:
+    """A study, from its file or its content. Raises UsageError with one line per problem.
+
+    Paths in a file are relative to its folder; where there is no such file, they stay as they are, for names.
+    """
+    if isinstance(study, Study):
+        return study
+    where, folder = "study", Path.cwd()
+    content: Mapping[str, Any]
+    if isinstance(study, Mapping):
+        content = study
+    else:
+        file = Path(study)
+        where, folder = str(file), file.absolute().parent
+        try:
+            content = load_yaml(file, "a study", "do: scan").content
+        except FileError as error:
+            raise UsageError.of(error.problems) from error
+    try:
+        made = Study.model_validate(content)
+    except ValidationError as error:
+        raise UsageError.of(_in_a_line(where, dict(each)) for each in error.errors()) from error
+    if problems := made.problems():
+        raise UsageError.of(f"{where}: {problem}" for problem in problems)
+    return made.model_copy(
+        update={
+            "vary": {key: [_anchored(key, value, folder) for value in values] for key, values in made.vary.items()},
+            **{name: [_anchored_all(one, folder) for one in getattr(made, name)] for name in ("also", "omit")},
+            "set": _anchored_all(made.set, folder),
+        }
+    )
+
+
+def _anchored_all(setting: Setting, folder: Path) -> Setting:
+    return {key: _anchored(key, value, folder) for key, value in setting.items()}
+
+
+def _anchored(key: str, value: Any, folder: Path) -> Any:
+    if key not in PATHS or not isinstance(value, str):
+        return value
+    path = folder / Path(value).expanduser()
+    return str(path) if path.exists() else value
+
+
+def _in_a_line(where: str, error: Mapping[str, Any]) -> str:
+    key = ".".join(map(str, error["loc"])) or "its content"
+    said = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        return f"{where}: {key!r} is no key of a study; its keys are {', '.join(Study.model_fields)}"
+    return f"{where}: {key}: {said[:1].lower()}{said[1:]}"

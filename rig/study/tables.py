@@ -1,0 +1,150 @@
+"""One table, figure and page of any study, made from the folder of its batch.
+
+A line for each case, or for each of the rows that a case returns; a column for each setting that varies and each figure
+of the result. The figure shows the numbers over the setting with the most values that are numbers.
+"""
+
+import csv
+import io
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeGuard
+
+from calibration.errors import digits
+from rig.batch.store import Row, read_failures, read_rows
+from rig.errors import UsageError
+from rig.report.charts import Panel, Series, legend, panel_svg
+from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
+
+Line = dict[str, Any]
+
+MOST_PANELS: Final = 6
+MOST_CURVES: Final = 12
+SHOWN_LINES: Final = 500
+"""Most lines of the page's table; the file has all."""
+COLOURS: Final = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7b8896"
+"""Colours that the colour-blind can tell apart (Okabe and Ito, 'Color universal design', 2008)."""
+FIRST: Final = "depth_error_m", "stripe_error_px", "mean_abs_px", "mean_px", "valid_fraction"
+"""Figures that are shown before others."""
+SEED: Final = "seed"
+
+
+def lines_of(rows: Sequence[Row]) -> tuple[list[Line], list[str]]:
+    """Lines of the table, and the names of the columns that are settings. Nested figures have dotted names."""
+    lines: list[Line] = []
+    labels = list(dict.fromkeys(key for row in rows for key in row.labels))
+    for row in rows:
+        result, measured = dict(row.result), dict(row.measured)
+        parts = result.pop("rows", [{}])
+        for number, part in enumerate(parts):
+            own = {key: value[number] for key, value in measured.items() if _is_of(value, parts)}
+            figures = dict(_flat({**result, **part, **own}))
+            lines.append({**row.labels, **{key: figures[key] for key in figures if key not in row.labels}})
+    if any("rows" in row.result for row in rows):  # what tells the rows of a case from each other is a setting too
+        labels += [key for key in ("estimator", "filter", "strategy") if lines and key in lines[0]]
+    return lines, list(dict.fromkeys(labels))
+
+
+def _is_of(value: object, parts: Sequence[object]) -> bool:
+    return isinstance(value, list) and len(value) == len(parts)
+
+
+def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{key}.")
+        elif isinstance(value, list):
+            yield f"{before}{key}", "; ".join(map(str, value))
+        else:
+            yield f"{before}{key}", value
+
+
+def csv_text(lines: Sequence[Line]) -> str:
+    """The table as CSV."""
+    columns = list(dict.fromkeys(key for line in lines for key in line))
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return stream.getvalue()
+
+
+def study_report(folder: Path) -> str:
+    """The page on a study's folder. Raises UsageError if there is none, or no case is done."""
+    rows = list(read_rows(folder))
+    failures = read_failures(folder)
+    if not rows:
+        raise UsageError(f"{folder} has no finished case yet; run `rig batch` first")
+    lines, labels = lines_of(rows)
+    panels = panels_of(lines, labels)
+    total = sum(1 for _ in (folder / "cases.jsonl").open(encoding="utf-8"))
+    whole = len(rows) == total
+    said = f"{len(rows)} of {total} cases are done"
+    columns = list(dict.fromkeys(key for line in lines for key in line))
+    cells = [[_cell(line.get(key)) for key in columns] for line in lines[:SHOWN_LINES]]
+    more = paragraph(f"{len(lines) - SHOWN_LINES} more lines are in table.csv", small=True)
+    series = {each.label: each for panel in panels for each in panel.series}
+    charts = legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels])
+    return page(
+        f"Study {folder.absolute().name}",
+        [verdict_box("complete" if whole else "part", said, [_said(each) for each in failures], good=whole)],
+        [
+            ("Figures", charts if panels else ""),
+            ("All cases", table(columns, cells) + (more if len(lines) > SHOWN_LINES else "")),
+            ("Repeat failed cases", preformatted("\n".join(each["command"] for each in failures)) if failures else ""),
+        ],
+    )
+
+
+def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
+    """A panel for each figure of interest, over the setting with the most numbers; a curve for the other settings.
+
+    Points are means over seeds, with the range of the seeds as a bar.
+    """
+    over = max((key for key in labels if key != SEED), key=lambda key: len(_numbers(lines, key)), default=None)
+    if over is None or len(_numbers(lines, over)) < 2:
+        return []
+    others = [key for key in labels if key not in (over, SEED) and len({str(line.get(key)) for line in lines}) > 1]
+    figures = [key for key in dict.fromkeys(k for line in lines for k in line) if key not in labels]
+    shown = [key for key in figures if len(_numbers(lines, key)) > 1]
+    shown.sort(key=lambda key: next((i for i, first in enumerate(FIRST) if key.startswith(first)), len(FIRST)))
+    panels = []
+    for key in shown[:MOST_PANELS]:
+        curves: dict[str, dict[float, list[float]]] = {}
+        for line in lines:
+            x, y = line.get(over), line.get(key)
+            if _is_number(x) and _is_number(y):
+                label = ", ".join(str(line.get(other)) for other in others)
+                curves.setdefault(label, {}).setdefault(float(x), []).append(float(y))
+        series = [
+            Series(
+                label or key,
+                COLOURS[number % len(COLOURS)],
+                [(x, statistics.fmean(values)) for x, values in sorted(points.items())],
+                [(min(values), max(values)) for _, values in sorted(points.items())],
+                dashed=number >= len(COLOURS),
+            )
+            for number, (label, points) in enumerate(list(curves.items())[:MOST_CURVES])
+        ]
+        positive = all(y > 0 for each in series for _, y in each.points)
+        panels.append(Panel(key, over, key, series, x_log=min(_numbers(lines, over)) > 0, y_log=positive))
+    return panels
+
+
+def _numbers(lines: Sequence[Line], key: str) -> set[float]:
+    return {float(value) for line in lines if _is_number(value := line.get(key))}
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    return digits(value) if isinstance(value, float) else str(value)
+
+
+def _said(failure: Mapping[str, Any]) -> str:
+    return f"{failure['kind']} ({failure['attempts']} times): {failure['message']}"
