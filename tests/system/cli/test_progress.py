@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rig import api
-from rig.cli import calibrate, devices, recordings, scan, view
+from rig.cli import calibrate, computing, devices, recordings, scan, view
 from rig.cli.command import Commands
 from rig.cli.tables import effects_table
 from rig.scan.monitor import ScanProgress
