@@ -24,8 +24,8 @@ from drivers.errors import CorruptBlock, UnsupportedBlock
 from drivers.frames import FrameBlock
 from drivers.recorded.order import Entries, in_order
 from drivers.recorded.segments import SegmentReader
-from drivers.spb1 import ALIGN, BlockLayout, Damage, Placed, parse_block
-from drivers.spb1.layout import MAX_FRAMES
+from drivers.spb1 import ALIGN, TRAILER_BYTES, BlockLayout, Damage, Placed, parse_block
+from drivers.spb1.layout import MAX_FRAMES, TRAILER
 from drivers.spb1.reader import MAX_COUNT
 
 INDEX_FILE: Final = "frames.idx"
@@ -151,6 +151,14 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
     if block is None:
         raise CorruptBlock(f"not block {entry['block_seq']} of run {entry['run_id']}, of which {INDEX_FILE} tells")
     return block
+
+
+def payload_crc(segment: SegmentReader, offset: int, length: int) -> int:
+    """CRC of a block's payload, as the trailer states it at the end of its `length` bytes. Raises CorruptBlock."""
+    raw = segment.at(offset + length - TRAILER_BYTES, TRAILER_BYTES)
+    if len(raw) < TRAILER_BYTES:
+        raise CorruptBlock(f"{segment.path.name} ends within the block at byte {offset}")
+    return int(TRAILER.unpack(raw.tobytes())[4])
 
 
 def _told(folder: Path, problems: list[str]) -> Entries | None:

@@ -20,9 +20,9 @@ import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.frames import BlockFlag, BlockHeader, FrameBlock
-from drivers.recorded.contents import find_blocks, read_entry
+from drivers.recorded.contents import find_blocks, payload_crc, read_entry
 from drivers.recorded.order import Entries
-from drivers.recorded.segments import open_segments
+from drivers.recorded.segments import PlainSegment, open_segments
 
 READERS: Final = 2
 """Threads that read ahead."""
@@ -123,6 +123,17 @@ class RunRecording:
         wanted = run.entries[(begins < end) & (begins + run.entries["n_frames"] > first)]
         for block in self._read(run, wanted):
             yield block_part(block, first, end)
+
+    def payload_crcs(self) -> list[int] | None:
+        """CRC of the payload of every block, as its trailer states it, in the order of `runs`; None if any segment is
+        compressed. Raises CorruptBlock."""
+        if not all(isinstance(segment, PlainSegment) for segment in self._segments.values()):
+            return None
+        return [
+            payload_crc(self._segments[int(entry["segment"])], int(entry["offset"]), int(entry["length"]))
+            for run in self.runs
+            for entry in run.entries
+        ]
 
     def read(self, run: RecordedRun, entry: Any) -> FrameBlock | None:
         """The block of one entry of a run. If it is damaged, returns None and adds a line to `problems`."""

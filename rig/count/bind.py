@@ -30,6 +30,9 @@ from rig.plan.scan_plan import MAX_CLOCK_ERROR, ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
 """Largest distance of a marker from the straight line, point over time, that is fitted to a synchronised sweep."""
+MOST_UNLIT = 1
+"""Most frames of a synchronised sweep that lie on columns with the gate low throughout. The plan opens the gate a whole
+frame early and closes it a whole frame late, so there are none; a flipped bit makes one."""
 MOST_OUT_OF_TURN = 1000
 """Most frames during a sweep that may name another sweep which cannot have begun. Flipped bits cause a few; more mean
 that the marker's line or the link is faulty."""
@@ -39,13 +42,17 @@ UNITS_PER_TICK = 2 * (SUBFRAME_MASK + 1)
 """Units of time in a tick. In whole units (int64) markers and middles of exposures are exact, so that a frame's column
 is the same to the last bit in whatever block it comes. int64 suffices for 200 days at 1 GHz."""
 CARRIED = np.dtype(
-    [(name, np.int64) for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "column", "in_column")]
+    [
+        (name, np.int64)
+        for name in ("sweep", "anchor_time", "anchor_point", "edges", "wrong_way", "unlit", "column", "in_column")
+    ]
 )
 """State that the walk carries from block to block.
 
 sweep: the present one, -1 before the first marker. anchor_time, anchor_point: of the latest marker, in units and in
-points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way: as in `SweepClock`.
-column, in_column: the column that the sweep has come to, -1 before the first, and its number of frames so far.
+points since the first sweep; point -1: none yet. edges: markers of the sweep so far. wrong_way, unlit: as in
+`SweepClock`. column, in_column: the column that the sweep has come to, -1 before the first, and its number of frames so
+far.
 """
 
 
@@ -74,7 +81,8 @@ class SweepClock:
     blanking patterns, the distance of the pattern after the sweep from the line through those before it, or the
     standard deviation of that distance if it is larger; NaN if that pattern was not found. markers: number of markers
     or patterns that the clock is fitted to. first_frame, end_frame: numbers of the first frame of this sweep and of the
-    next one. wrong_way: number of lit frames in which the scanner's direction signal was not the plan's. detection:
+    next one. wrong_way: number of lit frames in which the scanner's direction signal was not the plan's. unlit: number
+    of frames on columns in which the gate was low throughout: markers and gate contradict each other. detection:
     chance that a pattern as bright as this sweep's is found, 0 if it was not; None if markers were used.
     """
 
@@ -85,6 +93,7 @@ class SweepClock:
     first_frame: int
     end_frame: int
     wrong_way: int
+    unlit: int = 0
     detection: float | None = None
 
     @property
@@ -94,6 +103,7 @@ class SweepClock:
             self.residual_columns <= MAX_RESIDUAL_COLUMNS
             and abs(self.clock_error) <= MAX_CLOCK_ERROR
             and self.wrong_way == 0
+            and self.unlit <= MOST_UNLIT
         )
 
 
@@ -285,8 +295,9 @@ class FrameBinder:
         for ended, place in pairwise(places):
             clock = place.ratio - 1, place.residual_frames / self._plan.exposures, place.patterns
             frames = self._first_frame, place.frame
-            closed.append(SweepClock(ended.number, *clock, *frames, int(now["wrong_way"]), ended.detection))
-            self._first_frame, now["wrong_way"] = place.frame, 0
+            marks = int(now["wrong_way"]), int(now["unlit"])
+            closed.append(SweepClock(ended.number, *clock, *frames, *marks, ended.detection))
+            self._first_frame, now["wrong_way"], now["unlit"] = place.frame, 0, 0
         place = places[-1]
         if running < 0:
             self._first_frame = place.frame
@@ -314,11 +325,11 @@ class FrameBinder:
         nominal = self._points_per_unit(tick_hz) / self._ratio
         point, time = self._edges[0, : now["edges"]], self._edges[1, : now["edges"]]
         fit = _fit(point, time, nominal, float(self._plan.points_per_column))
-        clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]))
+        clock = SweepClock(number, *fit, self._first_frame, end_frame, int(now["wrong_way"]), int(now["unlit"]))
         if number >= self._first_sweep and fit[2] > 2 and clock.synchronised:
             self._ratio = 1 + clock.clock_error
         self._first_frame = end_frame
-        now["edges"] = now["wrong_way"] = 0
+        now["edges"] = now["wrong_way"] = now["unlit"] = 0
         return clock
 
     def _points_per_unit(self, tick_hz: Fraction) -> float:

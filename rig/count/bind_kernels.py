@@ -112,6 +112,8 @@ def walk(
             done = (tau_s - plan.lit_start_s[leg]) / plan.column_s
             column[i] = done - 0.5 if plan.columns_rise[leg] else plan.columns - 0.5 - done
         bins[i] = _bin(marks, column[i], plan.columns)
+        if bins[i] == BIN_DARK and number == now.sweep and 0 <= np.floor(column[i] + 0.5) < plan.columns:
+            now.unlit += 1
         if bins[i] >= 0:
             bins[i] = _in_order(bins[i], number, plan, carried)
     return len(records)

@@ -3,10 +3,15 @@
 `check_segments` finds the sound blocks. `Continuity` finds gaps before and between them by their numbers. A gap
 at the end of a start, or at the beginning of a cut part, does not show there: `lost_ends` finds it in the index and
 the manifest. A `run` is here one start of the SPAD (frames without a pause), whose run id is in every block.
+
+The seal of a recording is one number in its manifest, of the frames of all its blocks in their order: the CRC-32 of the
+payload CRCs (u32, little-endian) in the trailers. Blocks of two recordings made by the same plan fit each other in all
+their numbers. If they are mixed, only the seal shows it (`seal_problem`).
 """
 
+import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,14 +20,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import CorruptBlock
 from drivers.frames import BlockHeader
-from drivers.recorded.contents import Contents, damage_line, index_of
+from drivers.recorded import RunRecording
+from drivers.recorded.contents import Contents, damage_line, index_of, payload_crc
 from drivers.recorded.order import in_order
 from drivers.recorded.segments import SegmentReader
 from drivers.spb1 import HEADER_BYTES, TRAILER_BYTES, BlockLayout, Placed
-from drivers.spb1.layout import MAX_FRAMES, TRAILER
+from drivers.spb1.layout import MAX_FRAMES
+from rig.errors import DamagedRecordingError
 from rig.progress import tell_stage
-from rig.run_folder.manifest import RunGap, device_counters, ended_early
+from rig.run_folder.manifest import UNFINISHED, RunGap, device_counters, ended_early, read_manifest
 
 CHECKING: Final = "checking every block"
 CHECKERS: Final = 2
@@ -35,6 +43,10 @@ _NEIGHBOURS: Final = 2
 _FEW: Final = 4
 """At most one in this many blocks of a start is left out because of its ticks or sweep (one if there are three)."""
 
+FRAMES_SEAL: Final = "payloads_crc32"
+"""Key of the manifest's section `recording`."""
+_CRC: Final = struct.Struct("<I")
+
 
 @dataclass(frozen=True, slots=True)
 class SoundBlock:
@@ -42,7 +54,8 @@ class SoundBlock:
 
     entry: its index record. first_tick, last_tick: of its first and last frame; 0 if it has none. last_sweep: number of
     scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose ticks do not rise; they
-    count as missing. objection: why the block cannot be what was recorded; None if it can.
+    count as missing. payload_crc: as its trailer states it. objection: why the block cannot be what was recorded; None
+    if it can.
     """
 
     entry: bytes
@@ -52,6 +65,7 @@ class SoundBlock:
     first_tick: int
     last_tick: int
     repeated: tuple[tuple[int, int], ...]
+    payload_crc: int
     objection: str | None
 
     @property
@@ -221,6 +235,7 @@ def _sound(segment: SegmentReader, placed: Placed) -> SoundBlock:
         int(ticks[0]) if len(ticks) else 0,
         int(ticks[-1]) if len(ticks) else 0,
         tuple(_stretches(header.first_frame + 1 + np.flatnonzero(np.diff(ticks) <= 0))),
+        payload_crc(segment, placed.offset, placed.length),
         _objection(segment, placed),
     )
 
@@ -234,8 +249,7 @@ def _stretches(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
 
 def _objection(segment: SegmentReader, placed: Placed) -> str | None:
     """Reason why a block without a wrong checksum cannot be what was recorded; None if it can."""
-    end = placed.offset + placed.length
-    if not TRAILER.unpack(segment.at(end - TRAILER_BYTES, TRAILER_BYTES).tobytes())[4]:  # 0: no CRC, or a CRC of 0
+    if not payload_crc(segment, placed.offset, placed.length):  # 0: no CRC, or a CRC of 0
         payload = segment.at(placed.offset + HEADER_BYTES, placed.length - HEADER_BYTES - TRAILER_BYTES)
         if zlib.crc32(payload.tobytes()) != 0:
             return "has no checksum of its pixels"
@@ -319,3 +333,41 @@ def _delivered_behind(runs: Sequence[Run], missing: Sequence[RunGap], manifest: 
     number = len(runs) - 1
     end = max([runs[-1][-1].end_frame, *(last + 1 for of, _, last in missing if of == number)])
     return [(number, end, end + left - 1)] if left > 0 else []
+
+
+def sealed(payload_crcs: Iterable[int], before: int = 0) -> int:
+    """The seal of blocks with these CRCs of their payloads. before: seal of the blocks before them."""
+    for crc in payload_crcs:
+        before = zlib.crc32(_CRC.pack(crc), before)
+    return before
+
+
+def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> str | None:
+    """A line if these blocks are as many as the manifest says, but not those of its seal; None if they are, or if
+    nothing can be said: without a seal, before the run's end, or with other blocks than the manifest's."""
+    crcs, recording = list(payload_crcs), manifest.get("recording") or {}
+    told = recording.get(FRAMES_SEAL)
+    if told is None or manifest.get("verdict") == UNFINISHED or recording.get("blocks") != len(crcs):
+        return None
+    if told == sealed(crcs):
+        return None
+    return "the frames are not those that this run recorded: segments of another recording may lie among its own"
+
+
+def require_own_frames(recording: RunRecording) -> None:
+    """Raise DamagedRecordingError if the frames of a recording are not those of its manifest's seal.
+
+    Reads the trailers of its blocks, not their pixels. Compressed ones would have to be unpacked for that, so only `rig
+    verify` looks at theirs.
+    """
+    manifest = read_manifest(recording.path) if recording.path.is_dir() else None
+    if manifest is None:
+        return
+    try:
+        crcs = recording.payload_crcs()
+    except CorruptBlock:
+        return  # reading it says what is wrong
+    if crcs is not None and (problem := seal_problem(crcs, manifest)) is not None:
+        raise DamagedRecordingError(
+            f"{recording.path}: {problem}; bring its own segments back, or let 'rig repair' take it as it is"
+        )

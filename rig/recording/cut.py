@@ -18,6 +18,7 @@ from drivers.recorded import RecordedRun, RunRecording
 from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
+from rig.recording.check import require_own_frames
 from rig.recording.open import MapSpan, fitted_ratio, manifest_or_none, map_spans, open_recording
 from rig.recording.writer import Recording
 from rig.requests import CutRequest
@@ -56,6 +57,7 @@ def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **chang
     if manifest is None:
         raise DamagedRecordingError(f"{folder}: {trouble}")
     require_playable(folder, manifest)
+    require_own_frames(recording)
     spans = map_spans(recording, manifest)
     parts = _parts(recording, spans, asked)
     with RunFolder(out) as target:

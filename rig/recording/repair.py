@@ -20,6 +20,7 @@ from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, index_header, ro
 from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
 from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
+from rig.recording.check import FRAMES_SEAL, sealed
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
 from rig.run_folder.disk import is_held, replace_file, sync_folder
@@ -226,6 +227,7 @@ def _recording(found: Examination) -> dict[str, Any]:
         "index": INDEX_FILE,
         "blocks": len(found.entries),
         "bytes": found.bytes,
+        FRAMES_SEAL: sealed(block.payload_crc for run in found.runs for block in run),
     }
     starts = ((found.manifest or {}).get("recording") or {}).get("starts")
     if starts is None:  # count whole sweeps

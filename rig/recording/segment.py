@@ -20,6 +20,7 @@ import numpy as np
 from calibration.errors import digits
 from drivers.frames import FrameBlock
 from drivers.spb1 import block_parts
+from drivers.spb1.layout import TRAILER
 from rig.errors import UsageError
 
 PAGE_BYTES: Final = 4096
@@ -71,9 +72,10 @@ class OpenSegment:
         self.placed += size
         return offset
 
-    def write(self, block: FrameBlock, offset: int, staging: Staging) -> None:
-        """Write a block at its place. The block's memory must not change until this returns. Raises OSError."""
-        pieces = _pieces(block, staging)
+    def write(self, block: FrameBlock, offset: int, staging: Staging) -> int:
+        """Write a block at its place; returns the CRC of its payload. The block's memory must not change until then.
+        Raises OSError."""
+        pieces, crc = _pieces(block, staging)
         while pieces:
             written = self._write(pieces, offset)
             offset += written
@@ -81,6 +83,7 @@ class OpenSegment:
                 written -= len(pieces.pop(0))
             if written:
                 pieces[0] = pieces[0][written:]
+        return crc
 
     def sync(self) -> None:
         """Make sure that the blocks before `end` survive a loss of power. Raises OSError."""
@@ -120,8 +123,9 @@ def paged(size: int) -> int:
     return -(-size // PAGE_BYTES) * PAGE_BYTES
 
 
-def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
-    """A block's bytes with its padding. Whole pages of pixels stay in place if aligned; the rest is in `staging`."""
+def _pieces(block: FrameBlock, staging: Staging) -> tuple[list[memoryview], int]:
+    """A block's bytes with its padding, and the CRC of its payload. Whole pages of pixels stay in place if aligned; the
+    rest is in `staging`."""
     *front, bits, tail = block_parts(block)
     front_bytes = sum(len(part) for part in front)
     before = min(paged(front_bytes) - front_bytes, len(bits))
@@ -137,7 +141,8 @@ def _pieces(block: FrameBlock, staging: Staging) -> list[memoryview]:
         at += len(part)
     memory[at:] = bytes(len(memory) - at)
     split = front_bytes + before
-    return [piece for piece in (memory[:split], bits[before : before + inside], memory[split:]) if len(piece)]
+    pieces = memory[:split], bits[before : before + inside], memory[split:]
+    return [piece for piece in pieces if len(piece)], TRAILER.unpack_from(tail)[4]
 
 
 def _open_direct(path: Path) -> int:

@@ -17,7 +17,16 @@ from drivers.recorded.segments import PACKED_SUFFIX, SegmentReader, open_segment
 from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
-from rig.recording.check import CHECKING, Continuity, Run, SoundBlock, check_segments, lost_ends, out_of_step
+from rig.recording.check import (
+    CHECKING,
+    Continuity,
+    Run,
+    SoundBlock,
+    check_segments,
+    lost_ends,
+    out_of_step,
+    seal_problem,
+)
 from rig.recording.open import require_recording
 from rig.run_folder.manifest import (
     MANIFEST,
@@ -214,6 +223,8 @@ def _against_manifest(
         for key, found in there.items()
         if (stated := recording.get(key)) is not None and stated != found
     ]
+    if (problem := seal_problem((block.payload_crc for run in runs for block in run), manifest)) is not None:
+        problems.append(problem)
     counters, absurd = device_counters(manifest)
     delivered, lost = counters.get("delivered"), counters.get("lost")
     if delivered is not None and delivered != frames and (delivered < frames or ended_early(manifest) is None):

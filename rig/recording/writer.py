@@ -25,6 +25,7 @@ from drivers.recorded.contents import HEADER_BYTES, INDEX_FILE, RECORD_BYTES, in
 from drivers.ring import BlockRing, RingReader
 from drivers.spb1 import BlockLayout
 from rig.errors import RecordingError
+from rig.recording.check import FRAMES_SEAL, sealed
 from rig.recording.segment import OpenSegment, Staging, paged
 from rig.run_folder.disk import hold, sync_folder
 from rig.threads import StageThread
@@ -44,12 +45,12 @@ RESERVE_BYTES: Final = 1 << 20
 
 @dataclass(slots=True, eq=False)
 class _Placed:
-    """A block that is not indexed yet. end: offset of its end in its segment. done: whether it is written."""
+    """A block that is not indexed yet. end: offset of its end in its segment. payload_crc: None until it is written."""
 
     segment: OpenSegment
     end: int
     index_record: bytes
-    done: bool = False
+    payload_crc: int | None = None
 
 
 class Recording:
@@ -75,6 +76,7 @@ class Recording:
         """Number of blocks that are written and count."""
         self.bytes = 0
         """Bytes that these blocks take in the segments, with padding."""
+        self._seal = sealed([])
         self.busy_s = 0.0
         """Time for checksums and writing, summed over the writers."""
         self.files: list[str] = []
@@ -191,6 +193,7 @@ class Recording:
             "index": INDEX_FILE,
             "blocks": self.blocks,
             "bytes": self.bytes,
+            FRAMES_SEAL: self._seal,
             "sync_interval_s": SYNC_INTERVAL_S,
             "longest_unsynced_s": self.longest_unsynced_s,
             "failed": None if self._failure is None else _reason(self._failure),
@@ -222,7 +225,7 @@ class Recording:
         """Write one block, on a thread of the pool."""
         begun = time.perf_counter()
         try:
-            placed.segment.write(block, offset, self._staging)
+            placed.payload_crc = placed.segment.write(block, offset, self._staging)
             self._count(placed)
         except BaseException as error:
             with self._lock:
@@ -237,8 +240,7 @@ class Recording:
     def _count(self, placed: _Placed) -> None:
         """Note that a block is written, and index all written blocks before the first one that is not written yet."""
         with self._lock:
-            placed.done = True
-            while self._order and self._order[0].done:
+            while self._order and (crc := self._order[0].payload_crc) is not None:
                 first = self._order[0]
                 self._index.seek(HEADER_BYTES + self.blocks * RECORD_BYTES)  # a record may have been cut short before
                 if self._index.write(first.index_record) != RECORD_BYTES:
@@ -247,6 +249,7 @@ class Recording:
                 self.bytes += first.end - first.segment.end
                 first.segment.end = first.end
                 self.blocks += 1
+                self._seal = sealed([crc], self._seal)
 
     def _sync_on(self) -> None:
         """Sync at intervals until the recording is closed or a sync fails; runs as a thread."""

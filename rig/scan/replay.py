@@ -15,6 +15,7 @@ from drivers.transports.tap import CONTROL_FILE, TapFile
 from rig.config.models import RigConfig
 from rig.devices.open import open_rig
 from rig.errors import DivergedError, RigError
+from rig.recording.check import require_own_frames
 from rig.recording.inputs import read_plan
 from rig.recording.replay import RECORDED, recorded_sweeps
 from rig.requests import RunRequest
@@ -52,6 +53,7 @@ def play(
         try:
             with open_rig(config, tap=tap) as rig:
                 assert isinstance(rig.spad, ReplaySpad), "replay_config says so"
+                require_own_frames(rig.spad.recording)
                 compared = compared and _asks_for_the_same(rig.spad.recording, request.maps)
                 pace = rig.spad.pace
                 if steps is not None:

@@ -21,8 +21,8 @@ Truth = list[NDArray[np.float32]]
 class Wrong:
     """A wrong input.
 
-    what: is wrong, in words. true: the truth, or two, of which either is right. run: makes the depth. undisturbed: scans
-    the same without the wrong input, and gives the recording.
+    what: is wrong, in words. true: the truth, or two, of which either is right. run: makes the depth. undisturbed:
+    scans the same without the wrong input, and gives the recording.
     """
 
     what: str
@@ -49,11 +49,11 @@ def _of_cube(setting: Setting, change: Callable[[Cube], tuple[str, Cube]]) -> Wr
     return Wrong(f"cube: {what}", (truths(run),), lambda: cube.depth(setting, "depth"), lambda: run)
 
 
-def _of_recording(setting: Setting, change: Callable[[Recording], str], *others: Path) -> Wrong:
+def _of_recording(setting: Setting, change: Callable[[Recording], str], *others: Path, sealed: bool = True) -> Wrong:
     run = setting.scan("a")
     recording = Recording(shutil.copytree(run, setting.folder / "changed"))
     what = change(recording)
-    recording.write()
+    recording.write(sealed=sealed)
     true = truths(run), *(truths(other) for other in others)
     return Wrong(f"recording: {what}", true, lambda: setting.depth(recording.folder, "depth"), lambda: run)
 
@@ -115,9 +115,7 @@ def exposures_for_columns(setting: Setting) -> Wrong:
 
 def columns_reversed(setting: Setting) -> Wrong:
     """The last column first."""
-    return _of_cube(
-        setting, lambda cube: ("columns", replace(cube, frames=np.ascontiguousarray(cube.frames[::-1])))
-    )
+    return _of_cube(setting, lambda cube: ("columns", replace(cube, frames=np.ascontiguousarray(cube.frames[::-1]))))
 
 
 def half_a_column_late(setting: Setting) -> Wrong:
@@ -203,7 +201,7 @@ def segments_mixed(setting: Setting) -> Wrong:
         recording.take(second, slice(first, None))
         return f"from frame {first} on"
 
-    return _of_recording(setting, mixed)
+    return _of_recording(setting, mixed, sealed=False)
 
 
 def maps_mixed(setting: Setting) -> Wrong:
@@ -300,7 +298,10 @@ def scanner_stuck(setting: Setting) -> Wrong:
     """The mirror stands still from the first column, or from some column on, while all its signals go on."""
 
     def stands(recording: Recording) -> str:
-        exposures, share = recording.plan.exposures, 0.0 if setting.rng.random() < 0.5 else setting.rng.uniform(0.1, 0.9)
+        exposures, share = (
+            recording.plan.exposures,
+            0.0 if setting.rng.random() < 0.5 else setting.rng.uniform(0.1, 0.9),
+        )
         for frames in recording.maps():
             # Light of the column at which it stands, drawn anew from the frames around it for each later one.
             at = max(int(share * len(frames)), 2 * exposures)

@@ -4,8 +4,10 @@ A recording is changed in place: the sizes of its blocks stay as they are, and a
 looks as if it had been taken that way.
 """
 
+import json
 import zlib
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,7 @@ HEADER = np.dtype(
         ("pixels_offset", "<u4"), ("zero", "<u4"), ("header_crc", "<u4"),
     ]
 )  # fmt: skip
-RECORD = np.dtype(
-    [("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")]
-)
+RECORD = np.dtype([("marks", "<u4"), ("ticks", "<u4"), ("x0", "<u2"), ("y0", "<u2"), ("line", "<u2"), ("sweep", "<u2")])
 TRAILER = np.dtype(
     [
         ("magic", "S4"), ("status", "<u4"), ("block_seq", "<u8"), ("valid_payload_len", "<u4"), ("payload_crc", "<u4"),
@@ -98,7 +98,9 @@ class Recording:
         self.header = parts[0][0].copy()
         self.records = np.concatenate([records for _, records, _, _ in parts])
         self.pixels = np.concatenate([pixels for _, _, pixels, _ in parts])
-        self._t0 = np.concatenate([np.full(len(records), header["t0_ticks"], np.int64) for header, records, *_ in parts])
+        self._t0 = np.concatenate(
+            [np.full(len(records), header["t0_ticks"], np.int64) for header, records, *_ in parts]
+        )
 
     def _views(self, at: int) -> tuple[Any, Any, Frames, Any]:
         """Header, records, pixels and trailer of the block at this offset, to be read and written."""
@@ -140,7 +142,7 @@ class Recording:
         """Frames of the columns of each whole map, in order: columns x exposures of them."""
         wanted, column, found = self.plan.columns * self.plan.exposures, self.columns(), []
         ends = [*np.flatnonzero(self.records["marks"] & SCAN).tolist(), len(column)]
-        for first, end in zip(ends[:-1], ends[1:], strict=True):
+        for first, end in pairwise(ends):
             inside = first + np.flatnonzero(column[first:end] >= -0.5)
             inside = inside[(self.records["marks"][inside] & GATE_HIGH) > 0][:wanted]
             if len(inside) == wanted and end < len(column):
@@ -177,8 +179,10 @@ class Recording:
         for name, values in zip(("line", "sweep"), lines, strict=True):
             records[name] = np.where(last >= 0, values[inside][np.maximum(last, 0)], 0)
 
-    def write(self) -> None:
-        """Write the blocks back, with checksums that fit."""
+    def write(self, *, sealed: bool = True) -> None:
+        """Write the blocks back, with checksums that fit. sealed: as if they had been recorded so, not mixed later: the
+        manifest's seal of all frames fits too."""
+        seal = 0
         for entry, first in zip(self._index, self.blocks(), strict=True):
             at = int(entry["offset"])
             header, records, pixels, trailer = self._views(at)
@@ -189,8 +193,16 @@ class Recording:
             header["header_crc"] = zlib.crc32(header.tobytes()[:-4])
             payload = self._bytes[at + HEADER.itemsize :][: int(header["payload_len"])]
             trailer["payload_crc"] = zlib.crc32(payload.tobytes())
+            seal = zlib.crc32(trailer["payload_crc"].tobytes(), seal)
             trailer["crc"] = zlib.crc32(trailer.tobytes()[:-4])
             entry["crc"] = zlib.crc32(entry.tobytes()[:-4])
         self._bytes.tofile(self.folder / "frames-000000.spb")
         head = (self.folder / "frames.idx").read_bytes()[:INDEX_HEADER_BYTES]
         (self.folder / "frames.idx").write_bytes(head + self._index.tobytes())
+        if sealed:
+            file = self.folder / "manifest.json"
+            content = json.loads(file.read_text(encoding="utf-8"))
+            content["recording"]["payloads_crc32"] = seal
+            del content["crc32"]
+            content["crc32"] = zlib.crc32(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
+            file.write_text(json.dumps(content), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Settings by chance: a rig, a scene, exposures and an estimator; scans with them, and their depth against the truth."""
+"""Settings by chance: a rig, a scene, exposures and an estimator; scans with them, and depth against the truth."""
 
 import copy
 from collections.abc import Mapping
@@ -104,7 +104,7 @@ class Setting:
         return replace(self, scene="made in fog" if self.scene == "made in fog" else "made", seed=self.seed + 1)
 
     def scan(self, name: str, true: Content | None = None, power_mw: float = 50.0) -> Path:
-        """Record a scan; the folder of the run. true: geometry of the rig as it is, where that is not its calibration."""
+        """Record a scan; the folder of the run. true: geometry of the rig as it is, if that is not its calibration."""
         here = self.folder / name
         here.mkdir()
         write_yaml(here / "calibration.yaml", self.geometry)

@@ -18,9 +18,9 @@ def case(name: str, seed: int) -> dict[str, Any]:
     """The trial of this number of a case of `CASES`, in plain values.
 
     setting: what was drawn. what: what is wrong. off: largest relative depth error of a map at its median, None without
-    depth. undisturbed: the same without the wrong input, where `off` is more than OFF. wrong: whether `off` is more than
-    OFF, and more than WORSE times that. verdict: of the run, or 'error'.
-    reasons: of the verdict, or the error's lines. caught: whether verdict or error say that something is wrong.
+    depth. undisturbed: the same without the wrong input, if `off` is more than OFF. wrong: whether `off` is more than
+    OFF, and more than WORSE times that. verdict: of the run, or 'error'. reasons: of the verdict, or the error's lines.
+    caught: whether verdict or error say that something is wrong.
     """
     logging.getLogger().setLevel(logging.CRITICAL)  # what is wrong is worth warnings, and is to be in the verdict
     wanted = CASES[name]

@@ -108,3 +108,23 @@ def test_a_recording_says_before_it_starts_what_it_takes_at_most(
     frames = sum(file.stat().st_size for file in files if file.suffix == ".spb")
     assert 0 < frames <= told["recording_bytes"]
     assert sum(file.stat().st_size for file in files) <= told["recording_bytes"] + told["map_bytes"]
+
+
+def test_frames_of_another_recording_of_the_same_plan_are_refused(rig: Rig, small: Path) -> None:
+    for seed in (5, 6):
+        assert rig("scan", small, "--maps", 1, "--seed", seed, "--record", "--out", f"run{seed}").code == 0
+    for name in ("frames-000000.spb", "frames.idx"):
+        shutil.copy(f"run6/{name}", f"run5/{name}")
+    told = "the frames are not those that this run recorded"
+    verified = rig("verify", "run5")
+    assert verified.code == 1
+    assert told in verified.err
+    for command in (("reconstruct", "run5"), ("cut", "run5", "--maps", "0:1")):
+        refused = rig(*command, "--out", "depth")
+        assert refused.code == 1, refused.err
+        assert told in refused.err
+        assert not Path("depth").exists()
+    assert rig("repair", "run5").code == 0
+    taken = rig("reconstruct", "run5", "--out", "depth")
+    assert taken.code == 0, taken.err
+    assert_same(Path("run6"), Path("depth"))

@@ -264,3 +264,15 @@ def test_a_scan_marker_beside_a_gate_edge_does_not_say_where_in_its_frame_it_is(
     assert bind(plan, whole(stream))[1][0].synchronised
     stream.records["marks"][first] ^= np.uint16(0x80 << SUBFRAME_SHIFT | Mark.GATE_EDGE)
     assert bind(plan, whole(stream))[1][0].synchronised
+
+
+@pytest.mark.parametrize("late", [-4, 4])
+def test_markers_that_contradict_the_gate_flag_the_sweep(late):
+    plan = plan_of(scan(exposures=8))
+    stream = stream_of(plan, 2)
+    assert [clock.unlit for clock in bind(plan, whole(stream))[1]] == [0, 0]
+    gate = np.uint32(Mark.GATE_HIGH | Mark.GATE_EDGE)
+    stream.records["marks"] = stream.records["marks"] & ~gate | np.roll(stream.records["marks"] & gate, late)
+    _, clocks = bind(plan, whole(stream))
+    assert [clock.unlit > 1 for clock in clocks] == [True, True]
+    assert not any(clock.synchronised for clock in clocks)

@@ -127,13 +127,13 @@ def test_all_blocks_before_one_that_could_not_be_written_count_and_none_behind_i
 ) -> None:
     write, through = OpenSegment.write, threading.Semaphore(0)
 
-    def failing(self: OpenSegment, block: FrameBlock, *others: object) -> None:
+    def failing(self: OpenSegment, block: FrameBlock, *others: object) -> int:
         if block.header.block_seq == slow:
             assert all(through.acquire(timeout=60) for _ in range(submitted - 1))
         try:
             if block.header.block_seq == 7:
                 raise OSError(errno.EIO, "Input/output error")
-            write(self, block, *others)  # type: ignore[arg-type]
+            return write(self, block, *others)  # type: ignore[arg-type]
         finally:
             through.release()
 
