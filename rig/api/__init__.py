@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rig.api.reports import ReportResult, report
     from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
     from rig.api.scans import plan_scan, reconstruct, replay, scan
+    from rig.api.split import reconstruct_parts
     from rig.api.steering import OnMap, SeenMap
     from rig.api.strategies import compare_strategies
     from rig.api.tradeoffs import tradeoff
@@ -135,6 +136,7 @@ __all__ = [
     "plan_text",
     "quality",
     "reconstruct",
+    "reconstruct_parts",
     "record",
     "recording_info",
     "repair",
@@ -160,6 +162,7 @@ _HOMES: Final = {
     "rig.api.rig": ("bench", "check_config", "devices", "doctor", "laser_off", "warm_up"),
     "rig.api.past_runs": ("runs",),
     "rig.api.scans": ("plan_scan", "reconstruct", "replay", "scan"),
+    "rig.api.split": ("reconstruct_parts",),
     "rig.api.steering": ("OnMap", "SeenMap"),
     "rig.api.strategies": ("compare_strategies",),
     "rig.api.tradeoffs": ("tradeoff",),

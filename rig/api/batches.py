@@ -93,7 +93,7 @@ def batch(
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     folder = Path(request.out).absolute()
     with Store(folder, made.cases, {"study": loaded.model_dump(mode="json")}, shared=shard[1] > 1) as store:
-        executor = _executor(request, store, limits, client)
+        executor = executor_of(request, store, limits, client)
         command = f"rig batch {_named(study)} --out {shlex.quote(str(request.out))}"
         done = run_batch(
             store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
@@ -179,7 +179,8 @@ _FIELDS = {
 """Options of trade-offs by the settings of studies."""
 
 
-def _executor(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
+def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
+    """What does the cases of a store, as the request says. Raises UsageError."""
     if client is None and request.cluster in (None, OWN_PROCESSES):
         return Pool(request.workers, limits)
     if request.workers is not None:

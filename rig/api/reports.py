@@ -1,4 +1,4 @@
-"""The call that makes one page of a run, of two runs side by side, of a calibration, or of a trade-off: `report`.
+"""The call that makes one page of a run, of two side by side, a calibration, a trade-off or a study: `report`.
 
 Most reports are of runs, and somebody waits for them. So modules that only other reports need are imported late.
 """
@@ -19,12 +19,13 @@ from rig.report.run_facts import read_run
 from rig.run_folder.disk import replace_file
 from rig.run_folder.runs import is_run
 
-_WHAT: Final = "name the folder of a run, a calibration or a trade-off, or a calibration.yaml"
+STUDY_FILE: Final = "study.json"
+_WHAT: Final = "name the folder of a run, a calibration, a trade-off or a study, or a calibration.yaml"
 
 
 @dataclass(frozen=True, slots=True)
 class ReportResult:
-    """A report that was written. kind: run, runs, calibration or tradeoff. missing: sentences on what it lacks."""
+    """A report that was written. kind: run, runs, calibration, tradeoff or study. missing: sentences on what it lacks."""
 
     file: Path
     kind: str
@@ -36,13 +37,13 @@ def report(
     run: PathLike, other: PathLike | None = None, *, out: PathLike | None = None, map: int | None = None
 ) -> ReportResult:
     """Write one HTML page, which needs no other file: of a run or recording, of two of them side by side, of a
-    calibration, or of a trade-off (`rig report`).
+    calibration, of a trade-off, or of a study (`rig report`).
 
     run: its folder; of a calibration also its file. other: a second run. out: the file to write; None: NAME-report.html
     beside the folder or file. An older report is replaced. map: number of the map that is shown; None: the last one.
     Whatever is missing in a run is named in the page.
 
-    Raises UsageError for anything else than a run, a calibration or a trade-off, for a map that is not there, and if
+    Raises UsageError for anything else than a run, a calibration, a trade-off or a study, for a map that is not there, and if
     the file cannot be written.
     """
     folder, second = Path(run), None if other is None else Path(other)
@@ -60,6 +61,10 @@ def report(
         missing = tuple(line if second is None else f"{each.folder}: {line}" for each in runs for line in each.missing)
     elif kind == "calibration":
         text = _calibration(folder)
+    elif kind == "study":
+        from rig.study.tables import study_report
+
+        text = study_report(folder)
     else:
         from rig.tradeoff.files import tradeoff_report
 
@@ -77,11 +82,13 @@ def _kind(path: Path) -> str:
             return "run"
         if (path / CALIBRATION_FILE).exists():
             return "calibration"
+        if (path / STUDY_FILE).exists():
+            return "study"
         from rig.tradeoff.files import TRADEOFF_FILE
 
         if (path / TRADEOFF_FILE).exists():
             return "tradeoff"
-        raise UsageError(f"{path} holds no run, no calibration and no trade-off; {_WHAT}")
+        raise UsageError(f"{path} holds no run, no calibration, no trade-off and no study; {_WHAT}")
     if path.suffix in (".yaml", ".yml"):
         return "calibration"
     raise UsageError(f"{path} is a file; {_WHAT}")

@@ -94,11 +94,23 @@ def reconstruct_command(
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="calibration.yaml", show_default="the recording's own")
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", help="by parts: local, or another as of rig batch", show_default="in one"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", help="parts at once on this computer", show_default="one a core", min=1),
+    ] = None,
 ) -> CommandResult:
     """Make depth maps from a recording, from imported frames or from a packed .npy cube of them."""
+    asked = replace(request, out=out)
     with progress():
-        result = api.reconstruct(source, plan, calibration, replace(request, out=out))
-    return report(result)
+        if cluster is None and workers is None:
+            return report(api.reconstruct(source, plan, calibration, asked))
+        if plan is not None:
+            raise UsageError("frames alone are not done by parts; leave --cluster and --workers out")
+        return report(api.reconstruct_parts(source, calibration, asked, cluster=cluster, workers=workers))
 
 
 def demo_command(

@@ -228,7 +228,7 @@ class MapTally:
     ) -> Summary:
         """Make the summary of the run so far."""
         errors = [each.errors for each in self._maps if each.errors is not None]
-        truth = TruthErrors(*(_over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
+        truth = TruthErrors(*(over_maps(kind) for kind in zip(*errors, strict=True))) if errors else None
         compute_s = sum(each.compute_s for each in self._maps)
         floating = [each.floating for each in self._maps if each.floating is not None]
         return Summary(
@@ -260,7 +260,8 @@ class MapTally:
         )
 
 
-def _over_maps(errors: Sequence[Errors]) -> Errors:
+def over_maps(errors: Sequence[Errors]) -> Errors:
+    """Errors of several maps together: means, but for medians the median."""
     combined: dict[str, float | None] = {}
     for key in errors[0]:
         known = [value for each in errors if (value := each[key]) is not None]

@@ -123,7 +123,7 @@ def test_a_trade_off_has_the_page_that_it_wrote_itself(rig: Rig, small: Path) ->
     ("arguments", "said"),
     [
         (("gone",), "gone does not exist; name the folder of a run, a calibration or a trade-off"),
-        (("empty",), "empty holds no run, no calibration and no trade-off; name the folder"),
+        (("empty",), "empty holds no run, no calibration, no trade-off and no study; name the folder"),
         (("notes.txt",), "notes.txt is a file; name the folder"),
         (("RUN", "empty"), "empty holds no run"),
         (("RUN", "--map", "9"), "map 9 is not in"),
