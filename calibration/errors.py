@@ -1,6 +1,13 @@
-"""The errors of this package, and numbers in messages: few digits and, but for condition numbers, no powers of ten."""
+"""The errors of this package, and what stands in messages: numbers of few digits and, but for condition numbers,
+without powers of ten; text that a terminal can show."""
 
 import numpy as np
+
+
+def plain_text(text: str) -> str:
+    """Text from a file, for a message of one line: characters that cannot be printed, such as line breaks and those
+    that command a terminal, are shown as their escapes."""
+    return text if text.isprintable() else "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 class CalibrationError(ValueError):

@@ -19,6 +19,8 @@ Key = tuple[str, ...]
 Model = TypeVar("Model", bound=BaseModel)
 KindOf = Callable[[str, Any], type[BaseModel] | None]
 
+MAX_PROBLEMS = 100
+"""Most problems that are told one by one: a file of another kind may have a million."""
 MAX_VALUE_CHARACTERS = 60
 """Longer values are cut in messages, so that a message stays one line."""
 
@@ -132,7 +134,8 @@ def validated(
     kind_of: KindOf = lambda name, content: None,
     context: Mapping[str, Any] | None = None,
 ) -> Model:
-    """The content as a model. Raises FileError with a line for each problem, in the order of the file.
+    """The content as a model. Raises FileError with a line for each problem, in the order of the file; of very many
+    problems only the first ones have a line.
 
     Stricter than pydantic: true and false are not numbers, and numbers must be finite. kind_of: gives the model of a
     section whose model depends on its content, from the section's name and content. context: for pydantic's validators.
@@ -145,23 +148,34 @@ def validated(
     except ValidationError as error:
         for problem in error.errors():
             found.setdefault(_key(problem, content), []).append(problem)
-    told = []
+    no_numbers = {}
     for key, value, words in _no_numbers(schema, model, content, ()):
         if all(problem["type"] in _BOUNDS for problem in found.get(key, [])):  # pydantic compares true as 1, and NaN
             found.pop(key, None)
-            dotted, then = sources.flag(key) or ".".join(key), _then(key, schema, sources.flag(key))
-            told.append((key, f"{dotted} is {_shown(value)}, it must be {words}{then}"))
-    keys = [*found, *(key for key, _ in told)]
-    for key, problems in found.items():
-        # If a value may have several forms and has problems inside, it is no news that other forms do not fit.
-        shape = all(one["type"] == "literal_error" or one["type"].endswith("_type") for one in problems)
-        if not (shape and any(len(other) > len(key) and other[: len(key)] == key for other in keys)):
-            told.append((key, _text(problems, key, schema, sources.flag(key))))
-    if result is not None and not told:
+            no_numbers[key] = value, words
+    outer = {key[:n] for key in (*found, *no_numbers) for n in range(len(key))}
+    # If a value may have several forms and has problems inside, it is no news that other forms do not fit.
+    wrong = [*no_numbers, *(key for key, problems in found.items() if not (key in outer and _of_form(problems)))]
+    if result is not None and not wrong:
         return result
-    told.sort(key=lambda item: sources.line(item[0]) or 0)
-    lines = [text if sources.flag(key) else f"{sources.place(key)} {text}" for key, text in told]
+    wrong.sort(key=lambda key: sources.line(key) or 0)
+    lines = []
+    for key in wrong[:MAX_PROBLEMS]:
+        flag = sources.flag(key)
+        if key in no_numbers:
+            value, words = no_numbers[key]
+            text = f"{flag or '.'.join(key)} is {_shown(value)}, it must be {words}{_then(key, schema, flag)}"
+        else:
+            text = _text(found[key], key, schema, flag)
+        lines.append(text if flag else f"{sources.place(key)} {text}")
+    if len(wrong) > MAX_PROBLEMS:
+        lines.append(f"{sources.file}: {len(wrong) - MAX_PROBLEMS} more problems; is it a file of another kind?")
     raise FileError(*dict.fromkeys(lines))
+
+
+def _of_form(problems: list[ErrorDetails]) -> bool:
+    """Whether the problems of a value say no more than that it has another form."""
+    return all(one["type"] == "literal_error" or one["type"].endswith("_type") for one in problems)
 
 
 def _no_numbers(

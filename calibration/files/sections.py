@@ -11,8 +11,8 @@ from typing import Annotated, Any, Final, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibration.errors import FileError
-from calibration.files.problems import Key
+from calibration.errors import FileError, plain_text
+from calibration.files.problems import MAX_PROBLEMS, Key
 from calibration.verdict import VerdictWord
 
 FORMAT = "spadrig-calibration"
@@ -145,6 +145,11 @@ MAX_REPEATED: Final = 100_000
 """Most values that aliases may repeat: with nested aliases, nine lines can stand for a billion values."""
 MAX_WHOLE: Final = 1 << 64
 """Whole numbers must be smaller in size: counts, identifiers and seeds have at most 64 bits."""
+_MOST_KEY: Final = 200
+"""Most characters of a key."""
+_MOST_DIGITS: Final = 400
+"""Most characters of a number in base 60."""
+_NUMBERS: Final = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 _MOST_SHOWN: Final = 40
 
 
@@ -187,7 +192,7 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
-            twice = [] if node is None else _twice(node)  # before merge keys are resolved, since those may repeat keys
+            twice = [] if node is None else _twice(node, name)  # before merge keys are resolved, which may repeat keys
             content = None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
@@ -203,7 +208,8 @@ def parse_yaml(text: str, what: str, example: str, name: str) -> YamlFile:
         kind = "is empty" if content is None else f"holds {holds}"
         raise FileError(f"{name} {kind}; {what} must hold keys and values, e.g. '{example}'")
     if twice:
-        raise FileError(*(f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice))
+        told = [f"{name}:{line}: '{'.'.join(key)}' is given twice; keep one" for key, line in twice[:MAX_PROBLEMS]]
+        raise FileError(*told, *([f"{name}: {len(twice)} keys are given twice"] if len(twice) > MAX_PROBLEMS else []))
     return YamlFile(content, text, node)
 
 
@@ -220,6 +226,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """The value of a node. Raises _Refused for a value that does not fit and for a whole number too large."""
         try:
+            if node.tag in _NUMBERS and ":" in node.value and len(node.value) > _MOST_DIGITS:
+                raise ValueError("too long")  # in base 60 ('1:30') it would take a time with the square of its length
             value = super().construct_object(node, deep=deep)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             kind = node.tag.rpartition(":")[-1]
@@ -230,8 +238,9 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def _cut(node: yaml.Node) -> str:
-    text = str(node.value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+    form = "a list" if isinstance(node, yaml.SequenceNode) else "a mapping"
+    text = node.value if isinstance(node.value, str) else form
+    return plain_text(text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}...")
 
 
 def _require_bounded(text: str) -> None:
@@ -285,12 +294,18 @@ def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
             yield from _places(value, (*path, str(i)))
 
 
-def _twice(node: yaml.Node) -> list[tuple[Key, int]]:
-    """The keys that are given again, with the lines of their repetitions. Keys below a repeated key are left out."""
+def _twice(node: yaml.Node, name: str) -> list[tuple[Key, int]]:
+    """The keys that are given again, with the lines of their repetitions. Keys below a repeated key are left out.
+
+    Raises FileError for a key that a line on a terminal cannot show, since keys stand in messages. name: of the file.
+    """
     seen: set[Key] = set()
-    found: list[tuple[Key, int]] = []
+    found: dict[Key, int] = {}
     for key, line in _places(node, ()):
-        if key in seen and not any(key[: len(other)] == other for other, _ in found):
-            found.append((key, line))
+        if len(key[-1]) > _MOST_KEY or not key[-1].isprintable():
+            what = "characters that cannot be shown" if len(key[-1]) <= _MOST_KEY else f"over {_MOST_KEY} characters"
+            raise FileError(f"{name}:{line}: the key '{plain_text(key[-1][:_MOST_SHOWN])}' has {what}; correct it")
+        if key in seen and not any(key[:n] in found for n in range(1, len(key) + 1)):
+            found[key] = line
         seen.add(key)
-    return found
+    return list(found.items())

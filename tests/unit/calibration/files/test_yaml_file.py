@@ -1,6 +1,7 @@
 """The one reader of YAML files: what multiplies, nests, repeats or lies is refused in one line, by every file."""
 
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,9 @@ from typing import Any
 import pytest
 
 from calibration.board.board import load_board
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, FileError
 from calibration.files import sections as yaml_file
+from calibration.files.problems import MAX_PROBLEMS
 from calibration.files.rig_file import load_camera, load_rig_model
 from calibration.files.sections import MAX_DEPTH, load_yaml
 from drivers.errors import DeviceError
@@ -106,12 +108,42 @@ def test_values_and_bytes_are_counted(tmp_path: Path, monkeypatch: pytest.Monkey
         ("18446744073709551616", "is too large"),
         ("!!python/object/apply:os.getcwd []", "could not determine a constructor"),
         ("\x07", "not YAML"),
+        ("1" + ":1" * 300_000, r"1:1:1.*\.\.\. is no int"),
+        ("!!int '\\x1b[2J many\n\n words'", r"is no int"),
+        ("!!float [1]", "not YAML"),
     ],
 )
 def test_a_value_that_is_none_is_one_line(tmp_path: Path, value: str, said: str) -> None:
     with pytest.raises(CalibrationError, match=said.replace("^", r"\^")) as refused:
         read(tmp_path, f"a: {value}")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [(r'"\e[2J"', r"the key '\\x1b\[2J' has characters that cannot be shown"), ('"a\\nb"', "cannot be shown"),
+     ("k" * 201, "has over 200 characters")],
+)  # fmt: skip
+def test_a_key_can_be_shown_in_a_line(tmp_path: Path, key: str, said: str) -> None:
+    with pytest.raises(CalibrationError, match=said) as refused:
+        read(tmp_path, f"a: {{? {key} : 1}}")
+    assert str(refused.value).isprintable()
+
+
+def test_a_file_full_of_mistakes_is_told_in_no_time_by_its_first_ones(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    wrong = ", ".join(["1"] * 20_000)  # a text in each place was expected
+    file.write_text(f"format: spadrig-calibration\nversion: 1\nprovenance: {{corners: [{wrong}]}}\n")
+    begun_s = time.process_time()
+    with pytest.raises(FileError, match="'camera' is missing") as refused:
+        load_rig_model(file)
+    assert len(refused.value.problems) == MAX_PROBLEMS + 1
+    assert refused.value.problems[-1].endswith("19901 more problems; is it a file of another kind?")
+    file.write_text("".join(f"key{i}: 1\n" * 2 for i in range(5000)))
+    with pytest.raises(FileError, match="is given twice") as refused:
+        load_rig_model(file)
+    assert len(refused.value.problems) == MAX_PROBLEMS + 1
+    assert time.process_time() - begun_s < 5.0  # it took a time with the square of their number: minutes
 
 
 def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
