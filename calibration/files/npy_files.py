@@ -14,6 +14,8 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.errors import plain_text
+
 _MAGIC_BYTES: Final = 8
 _LENGTH_BYTES: Final = {1: 2, 2: 4, 3: 4}
 """Bytes that hold the length of the header, by version of the format."""
@@ -21,6 +23,10 @@ _MOST_HEADER_BYTES: Final = 10_000
 """numpy's own limit, which numpy checks only after it has read the whole header."""
 _DEFLATE_RATIO: Final = 1032
 """Bytes that one compressed byte can stand for at most (zlib's technical details)."""
+_MOST_RATIO: Final = 64
+_MOST_UNPACKED: Final = 256 << 20
+"""All arrays of an archive together may have so many times its bytes, or so many bytes: a stripe table of 1024 rows and
+1000 columns has a tenth of them."""
 
 
 def load_array(file: str | os.PathLike[str]) -> NDArray[Any]:
@@ -41,28 +47,37 @@ def load_arrays(file: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
 
 def _load(file: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
     with file.open("rb") as stream:
+        size = os.fstat(stream.fileno()).st_size
         try:
             is_archive = stream.read(4) == b"PK\x03\x04"
             stream.seek(0)
             if is_archive:
-                _check_archive(stream)
+                _check_archive(stream, size)
             else:
-                _check_array(stream, os.fstat(stream.fileno()).st_size)
+                _check_array(stream, size)
             stream.seek(0)
             loaded = np.load(stream, allow_pickle=False)
             return dict(loaded) if is_archive else loaded
         except Exception as error:
-            raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+            raise ValueError(plain_text(" ".join(str(error).split())) or type(error).__name__) from error
 
 
-def _check_archive(stream: IO[bytes]) -> None:
+def _check_archive(stream: IO[bytes], size: int) -> None:
+    """Raise ValueError for an archive that would take much more memory than it is large, or whose arrays do not fit."""
     with zipfile.ZipFile(stream) as archive:
-        for member in archive.infolist():
+        members = archive.infolist()
+        if sum(member.compress_size for member in members) > size:  # several may share the same bytes
+            raise ValueError(f"its {len(members)} arrays overlap")
+        unpacked = sum(member.file_size for member in members)
+        if unpacked > max(_MOST_UNPACKED, _MOST_RATIO * size):
+            raise ValueError(f"its arrays take {unpacked >> 20} MiB, it has {size} bytes")
+        for member in members:
             if member.file_size > _DEFLATE_RATIO * member.compress_size + _MOST_HEADER_BYTES:
                 raise ValueError(f"{member.filename} says that it holds {member.file_size} bytes, which it cannot")
-            if member.filename.endswith(".npy"):
-                with archive.open(member) as inside:
-                    _check_array(inside, member.file_size)
+            if not member.filename.endswith(".npy"):
+                raise ValueError(f"{member.filename} in it is no .npy file")
+            with archive.open(member) as inside:
+                _check_array(inside, member.file_size)
 
 
 def _check_array(stream: IO[bytes], size: int) -> None:

@@ -183,7 +183,7 @@ def test_headers_of_arrays_fit_their_files(tmp_path: Path, content: bytes) -> No
 def test_an_archive_does_not_hold_more_than_its_bytes_can_stand_for(tmp_path: Path) -> None:
     raw = bytearray(npz(npy((4,), "<f4", b"\0" * 16)))
     directory = raw.rindex(b"PK\x01\x02")
-    raw[directory + 24 : directory + 28] = (2**31).to_bytes(4, "little")  # the size of its member, unpacked
+    raw[directory + 24 : directory + 28] = (2**27).to_bytes(4, "little")  # the size of its member, unpacked
     (tmp_path / "file").write_bytes(raw)
     with pytest.raises(ValueError, match="which it cannot"):
         load_arrays(tmp_path / "file")
@@ -192,3 +192,39 @@ def test_an_archive_does_not_hold_more_than_its_bytes_can_stand_for(tmp_path: Pa
 def test_a_table_of_compressed_blocks_holds_no_more_than_they_can() -> None:
     packed = np.frombuffer(bytes(100) + table_bytes([(100, 1 << 31)]), np.uint8)
     assert FrameTable.read(packed).size == 0
+
+
+def archive(*, names: Sequence[str] = ("depth_m.npy",), zeros: int = 0) -> bytes:
+    """An archive whose members are compressed zeros."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as made:
+        for name in names:
+            made.writestr(name, npy((zeros,), "|u1", bytes(zeros)))
+    return stream.getvalue()
+
+
+def shared(raw: bytes, copies: int) -> bytes:
+    """An archive whose directory names its one member many times, each time as another array of the same bytes."""
+    directory, end = raw.rindex(b"PK\x01\x02"), raw.rindex(b"PK\x05\x06")
+    entry = raw[directory:end]
+    entries = b"".join(entry.replace(b"depth_m", b"%07d" % i) for i in range(copies))
+    counts = copies.to_bytes(2, "little") * 2 + len(entries).to_bytes(4, "little")
+    return raw[:directory] + entries + raw[end : end + 8] + counts + raw[end + 16 :]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (shared(archive(zeros=2**20), 200), "its 200 arrays overlap"),
+        (archive(zeros=2**28 + 2**20), "its arrays take 257 MiB, it has"),
+        (archive(names=("depth_m",), zeros=10), "depth_m in it is no .npy file"),
+    ],
+    ids=["overlap", "zeros", "name"],
+)
+def test_an_archive_is_no_bomb(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "file").write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=said):
+        load_arrays(tmp_path / "file")
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
