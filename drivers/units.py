@@ -19,6 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 _NUMBER = re.compile(
     r"(?P<mantissa>[+-]?(?:\d+\.?\d*|\.\d+))(?:[eE](?P<exponent>[+-]?\d{1,3}))?(?:/(?P<divisor>\d+))?", re.ASCII
 )
+_FRACTION = re.compile(r"-?\d{1,1000}(/\d{1,1000})?", re.ASCII)
 _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 
@@ -111,6 +112,14 @@ def parse_exact(text: object, dimension: str) -> Fraction:
     if divisor == 0:
         raise ValueError(f"{_shown(text)} divides by zero; {like}")
     return Fraction(f"{match['mantissa']}e{match['exponent'] or 0}") / divisor * known.units[unit]
+
+
+def parse_fraction(text: object) -> Fraction:
+    """The fraction of which `str` made a text, such as "100000/3". Raises ValueError for anything else: Fraction itself
+    reads 1e999999999 too, which takes minutes and gigabytes."""
+    if not isinstance(text, str) or _FRACTION.fullmatch(text) is None:
+        raise ValueError(f"{_shown(text)} is no fraction of whole numbers")
+    return Fraction(text)
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:

@@ -39,6 +39,7 @@ from drivers.registry import Kind, KindConfig, Surroundings
 from drivers.replay.pace import Pace, ReplayClock
 from drivers.ring import BlockRing
 from drivers.spb1 import BlockLayout, block_views, seal_block
+from drivers.units import parse_fraction
 
 MANIFEST = "manifest.json"
 
@@ -89,7 +90,7 @@ def _read(noted: dict[str, Any]) -> SpadInfo:
         width=int(noted["width"]),
         height=int(noted["height"]),
         rotation_deg=int(noted["rotation_deg"]),
-        max_frame_rate_hz=Fraction(noted["max_frame_rate_hz"]),
+        max_frame_rate_hz=parse_fraction(noted["max_frame_rate_hz"]),
         burst=None if noted["burst"] is None else BurstMode(**noted["burst"]),
         stream=None if noted["stream"] is None else StreamMode(**noted["stream"]),
         roi_step_px=int(noted["roi_step_px"]),

@@ -259,7 +259,7 @@ def _anchor_paths(content: dict[str, Any], folder: Path) -> None:
             kind = kind_of(slot, content[slot])
             for name, info in ({} if kind is None else kind.model_fields).items():
                 value = content[slot].get(name)
-                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and value not in scenes)
+                named = Path in plain_types(info.annotation) or ((slot, name) == SCENE and str(value) not in scenes)
                 if named and isinstance(value, str) and not value.startswith("~"):
                     content[slot][name] = _absolute(folder / value)
 

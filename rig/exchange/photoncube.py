@@ -112,8 +112,8 @@ def _width(file: Path, frames: NDArray[np.uint8], beside: Mapping[str, Any]) -> 
             raise UsageError(f"{file} is not packed, says {TRANSFORMS}; pack its bits with {PACK}")
         if beside.get("bitpack_dim") != 2:
             raise UsageError(
-                f"{file} is packed along axis {beside.get('bitpack_dim')}, says {TRANSFORMS}; pack it along the width, "
-                "axis 2"
+                f"{file} is packed along axis {beside.get('bitpack_dim')!r}, says {TRANSFORMS}; pack it along the "
+                "width, axis 2"
             )
         width = beside.get("w")
     else:
@@ -129,7 +129,9 @@ def _frame_rate(beside: Mapping[str, Any]) -> Fraction | None:
         return None
     try:
         (numerator, denominator), period = clock["tick_hz"], clock["frame_period_ticks"]
-        rate = Fraction(numerator, denominator) / Fraction(period) if period else None
+        if not isinstance(period, int):  # as text, 1e999999999 would take for ever
+            return None
+        rate = Fraction(numerator, denominator) / period if period else None
     except (KeyError, TypeError, ValueError, ArithmeticError):
         return None
     return rate if rate is None or rate > 0 else None

@@ -6,7 +6,6 @@ text ("100000/3"), arrays their dtype and values. Fields that a dataclass comput
 Fields marked `SINCE` are left out if they are None, and may be missing, so that older files can still be read.
 """
 
-import re
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -22,6 +21,7 @@ from calibration.errors import CalibrationError, FileError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model, save_rig_model
 from calibration.files.sections import load_yaml
 from calibration.model.rig_model import RigModel
+from drivers.units import parse_fraction
 from rig.config.files import PLAN_FORMAT
 from rig.errors import UsageError
 from rig.estimate.row.model import RowModel
@@ -148,7 +148,6 @@ def read_model(folder: Path) -> RigModel | None:
 
 
 T = TypeVar("T")
-_FRACTION = re.compile(r"-?\d+(/\d+)?", re.ASCII)
 SINCE = "since"
 """Key in the metadata of a field that the first recordings did not have. The default of such a field is None."""
 
@@ -201,9 +200,10 @@ def _read(kind: Any, content: Any, where: str) -> Any:
         kinds = [inner[0]] * len(items) if inner[1:] == (...,) else inner
         return tuple(_read(one, item, f"{where}[{i}]") for i, (one, item) in enumerate(zip(kinds, items, strict=True)))
     if kind is Fraction:
-        if _FRACTION.fullmatch(_need(content, str, where)) is None:  # Fraction reads 1e999999999 too
-            raise ValueError(f"{where} is {content!r}, which is no fraction of whole numbers")
-        return Fraction(content)
+        try:
+            return parse_fraction(content)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
     if kind is float:
         return float(_need(content, int | float, where))
     if origin is Literal:

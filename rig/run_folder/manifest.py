@@ -25,6 +25,8 @@ MOST_RUN_FRAMES: Final = 1 << 48
 _NEXT: Final = "'rig repair' writes a new one"
 
 Count = Annotated[int, Field(ge=0, lt=MOST_RUN_FRAMES)]
+Name = Annotated[str, Field(pattern=r"^[\w-][\w.-]*$")]
+"""Name of a file in the run's folder itself: files are copied by it, so it must not lead elsewhere."""
 Section = dict[str, Any] | None
 Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
 RunGap = tuple[int, int, int]
@@ -98,6 +100,14 @@ class _Rig(_Part):
     serials: dict[str, str] | None = None
 
 
+class _OnRequest(_Part):
+    parts: list[dict[str, Any]] | None = None
+
+
+class _Time(_Part):
+    starts: list[dict[str, Any]] | None = None
+
+
 class _Manifest(_Part):
     """The form of the manifest, as far as commands read it. A device's own counts are checked by `device_counters`."""
 
@@ -108,14 +118,16 @@ class _Manifest(_Part):
     rig: _Rig | None = None
     devices: dict[str, dict[str, Any]] | None = None
     versions: dict[str, str] | None = None
-    inputs: dict[str, Count] | None = None
+    inputs: dict[Name, Count] | None = None
     counters: Section = None
     recording: _Recording | None = None
     sweeps: list[_Sweep] | None = None
+    time: _Time | None = None
     cut: _Cut | None = None
     missing: list[Frames] | None = None
     repaired: list[Any] | None = None
     request: Section = None
+    on_request: _OnRequest | None = None
     note: str | None = None
     tags: list[str] | None = None
 
@@ -190,7 +202,9 @@ def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[s
 
 
 def file_crc32(path: Path) -> int:
-    """CRC-32 of a file, for the manifest. Raises OSError."""
+    """CRC-32 of a file, for the manifest. Raises OSError, also for anything that is no file, as it may have no end."""
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path.name} is no file")
     crc = 0
     with path.open("rb") as file:
         while piece := file.read(1 << 20):

@@ -171,10 +171,9 @@ def read_summary(folder: Path) -> Mapping[str, Any]:
 
 def _taken(manifest: Mapping[str, Any]) -> datetime | None:
     try:
-        taken = datetime.fromisoformat(str((manifest.get("rig") or {}).get("taken")))
-    except ValueError:
+        return datetime.fromisoformat(str((manifest.get("rig") or {}).get("taken"))).astimezone(UTC)
+    except (ValueError, OverflowError):  # the second at the ends of the calendar
         return None
-    return taken.astimezone(UTC)
 
 
 def _size_and_time(folder: Path) -> tuple[int, datetime]:

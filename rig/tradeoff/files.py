@@ -8,9 +8,10 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import BaseModel, Field
 
 from calibration.errors import digits
 from drivers.json_text import parse_json
@@ -61,14 +62,23 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     return stream.getvalue()
 
 
+class _TradeoffFile(BaseModel):
+    """What a page needs of the file."""
+
+    rows: Annotated[list[TradeoffRow], Field(min_length=1)]
+    verdict: str
+    advice: str
+    ci95_by: str
+    versions: dict[str, str] | None = None
+
+
 def tradeoff_report(folder: Path) -> str:
     """The text of the HTML file on a trade-off that was written to a folder. Raises UsageError if it cannot be read."""
     file = folder / TRADEOFF_FILE
     try:
         content = parse_json(file.read_bytes())
-        rows = [TradeoffRow(**{**row, "ci95": tuple(row["ci95"])}) for row in content["rows"]]
-        return _page(folder.absolute().name, content, rows)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return _page(folder.absolute().name, content, _TradeoffFile.model_validate(content).rows)
+    except (OSError, ValueError, ArithmeticError) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise UsageError(f"{file} is no trade-off of this version ({reason}); run rig tradeoff again") from error
 

@@ -112,13 +112,13 @@ class Access:
 
     def knows(self, token: str) -> bool:
         """Whether somebody who sends this token may ask; always where none is needed."""
-        return self.token is None or hmac.compare_digest(token.encode(), self.token.encode())
+        return self.token is None or hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
     def brings_token(self, asked: Asked) -> bool:
         """Whether a request that is no web socket has the right token in its address."""
         if self.token is None or asked.socket:
             return False
-        query = parse_qsl(urlsplit(asked.path).query)
+        query = parse_qsl(asked.path.partition("?")[2])
         return self._is_token([value for name, value in query if name == "token"])
 
     def _is_token(self, given: Sequence[str]) -> bool:

@@ -8,7 +8,6 @@ any. The JSON has the key `topic`. A message from a page is JSON with the key `a
 """
 
 import asyncio
-import json
 import threading
 import time
 from collections import deque
@@ -16,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.json_text import parse_json
 from rig.run_folder.plain_json import json_text
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ class PageWish:
     def parse(cls, page: int, text: str | bytes) -> "PageWish":
         """Read a message. Raises ValueError if no page of ours sends such a one."""
         try:
-            content = json.loads(text)
-        except RecursionError:
-            raise ValueError("nested too deeply") from None
+            content = parse_json(text)
+        except ValueError:
+            raise ValueError("no JSON") from None
         ask = content.get("ask") if isinstance(content, dict) else None
         wanted = WISHES.get(ask) if isinstance(ask, str) else None
         if wanted is None or not isinstance(ask, str) or content.keys() != {"ask", *wanted}:

@@ -17,7 +17,6 @@ from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import urlsplit
 
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
@@ -126,7 +125,7 @@ class ViewServer:
         refusal = self.access.refusal(asked)
         if refusal is not None:
             return _response(refusal.status, f"{refusal.why}\n".encode())
-        host, path = headers["Host"], urlsplit(request.path).path
+        host, path = headers["Host"], request.path.partition("?")[0]
         if asked.socket:
             route = self._routes.get(path)
             if route is None:
@@ -160,7 +159,7 @@ class ViewServer:
     async def _talk(self, viser_handler: Handler, connection: "ServerConnection") -> None:
         """Serve one web socket until it is closed."""
         assert connection.request is not None, "the handshake is over"
-        path = urlsplit(connection.request.path).path
+        path = connection.request.path.partition("?")[0]
         with self._counted(path):
             if path == DATA:
                 await self._pages.serve(connection)

@@ -28,7 +28,22 @@ def test_json_is_read_as_it_is_within_limits() -> None:
     }
 
 
-@pytest.mark.parametrize("text", [DEEP, "[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), LARGE, "9" * 5000, "{", ""])
+@pytest.mark.parametrize(
+    "text",
+    [
+        DEEP,
+        "[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1),
+        LARGE,
+        "9" * 5000,
+        "{",
+        "",
+        "NaN",
+        "-Infinity",
+        "1e999",
+        r'{"\u001b[2J": 1}',
+        r'[{"a\nb": 1}]',
+    ],
+)
 def test_anything_else_is_a_value_error_of_one_line(text: str) -> None:
     with pytest.raises(ValueError) as refused:
         parse_json(text)

@@ -1,0 +1,132 @@
+"""Files and requests of strangers: what `tests.campaigns.inputs` and a reader who meant harm have found."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import ProtocolError
+from drivers.replay.spad import recorded_info
+from rig.api import cut, import_frames
+from rig.config.files import load_config
+from rig.errors import DamagedRecordingError, RigError, UsageError
+from rig.recording.inputs import write_inputs
+from rig.recording.open import info, open_recording
+from rig.recording.verify import Integrity, verify
+from rig.requests import RunsRequest
+from rig.run_folder.manifest import MANIFEST, file_crc32, read_manifest, sealed_text
+from rig.run_folder.runs import DAMAGED, list_runs
+from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
+from rig.view.access import Access, Asked
+from rig.view.pages import PageWish
+from tests.unit.rig.count.streams import plan_of, rig_model, scan
+from tests.unit.rig.recording.recorded import record, run_blocks
+
+ENDLESS = "1e999999999"
+"""Text that `Fraction` reads, for minutes."""
+
+
+def recording(folder: Path, **manifest: Any) -> Path:
+    """A recording whose manifest says what it likes, with the right seal."""
+    write_inputs(record(folder, [run_blocks()], **manifest), plan_of(scan()), rig_model())
+    return folder
+
+
+def test_a_manifest_copies_no_file_from_or_to_elsewhere(tmp_path: Path) -> None:
+    secret = tmp_path / "payload"
+    secret.write_text("anything")
+    for name in ("../payload", str(secret), "..", "a/b", ""):
+        folder = recording(tmp_path / f"run-{len(name)}", inputs={name: file_crc32(secret)})
+        with pytest.raises(RigError, match=r"manifest\.json: inputs"):
+            cut(folder, tmp_path / "out" / "part", maps="0:1")
+        assert verify(folder).verdict is Integrity.DAMAGED
+    assert not (tmp_path / "out" / "payload").exists()
+
+
+def test_what_is_no_file_is_not_read_to_its_end(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "run", inputs={"zero": 0})
+    (folder / "zero").symlink_to("/dev/zero")
+    assert "zero cannot be read: zero is no file" in verify(folder).problems
+
+
+@pytest.mark.parametrize("time_of_day", [[], {"starts": 5}, {"starts": ["a"]}])
+def test_times_of_another_form_are_damage(tmp_path: Path, time_of_day: object) -> None:
+    folder = recording(tmp_path, time=time_of_day)
+    with pytest.raises(DamagedRecordingError, match=r"manifest\.json: time"):
+        read_manifest(folder)
+    assert info(folder).maps
+
+
+@pytest.mark.parametrize("taken", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59"])
+def test_a_run_from_the_end_of_time_is_listed(tmp_path: Path, taken: str) -> None:
+    recording(tmp_path / "run", rig={"taken": taken})
+    (entry,) = list_runs(tmp_path, RunsRequest())
+    assert entry.verdict == "complete"
+
+
+def test_a_manifest_that_is_no_utf_8_at_heart_is_listed_as_damaged(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "run")
+    (folder / MANIFEST).write_text(sealed_text(json.dumps({"note": "a", "rig": {"kinds": {"\x1b[2J": "a"}}})))
+    (entry,) = list_runs(tmp_path, RunsRequest())
+    assert entry.verdict == DAMAGED
+    assert entry.problem.isprintable()
+
+
+def test_a_fraction_as_text_takes_no_time(tmp_path: Path) -> None:
+    begun_s = time.process_time()
+    described = {
+        "model": "m", "serial": "0", "width": 64, "height": 4, "rotation_deg": 0, "max_frame_rate_hz": ENDLESS,
+        "burst": None, "stream": None, "roi_step_px": 64, "markers": True, "trigger_modes": [],
+    }  # fmt: skip
+    folder = recording(tmp_path / "run", devices={"spad": {"info": described}})
+    with pytest.raises(ProtocolError, match=r"no description of a SPAD"):
+        recorded_info(open_recording(folder))
+    np.save(tmp_path / "cube.npy", np.full((3, 2, 2), 7, np.uint8))
+    clock = {"tick_hz": [100_000_000, 1], "frame_period_ticks": ENDLESS}
+    (tmp_path / "cube.json").write_text(json.dumps({"format": "spadrig-frames", "width": 16, "clock": clock}))
+    assert import_frames("photoncube", [tmp_path / "cube.npy"], tmp_path / "import").frame_rate_hz is None
+    assert time.process_time() - begun_s < 5.0
+
+
+@pytest.mark.parametrize(
+    "change", [{"rows": []}, {"ci95_by": 1}, {"versions": [1]}, {"scene": 0.5}, {"mean_abs_px": 1e308}, {"ci95": [1]}]
+)
+def test_a_trade_off_with_other_content_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    row = {
+        "scene": "street", "fog": None, "estimator": "joint", "filter": "none", "exposures": 5, "lines": 1,
+        "sensor_ms": 5.0, "compute_ms": 3.0, "mean_abs_px": 0.1, "within_1px": 0.9, "missing": 0.0, "depth_mm": 5.0,
+        "ci95": [0.09, 0.11],
+    }  # fmt: skip
+    content = {"rows": [row | {key: value for key, value in change.items() if key in row}], "verdict": "complete"}
+    content |= {"advice": "take joint", "ci95_by": "blocks", "versions": {}}
+    file = tmp_path / TRADEOFF_FILE
+    file.write_text(json.dumps(content))
+    assert change.keys() & row.keys() or tradeoff_report(tmp_path)
+    file.write_text(json.dumps(content | {key: value for key, value in change.items() if key not in row}))
+    with pytest.raises(UsageError, match="is no trade-off of this version"):
+        tradeoff_report(tmp_path)
+
+
+@pytest.mark.parametrize("scene", ["[street]", "{a: 1}"])
+def test_a_scene_that_is_no_text_is_a_mistake_like_any_other(tmp_path: Path, scene: str) -> None:
+    (tmp_path / "rig.yaml").write_text(f"world: {{kind: simulated, scene: {scene}}}\n")
+    with pytest.raises(UsageError, match=r"world\.scene is"):
+        load_config(tmp_path / "rig.yaml")
+
+
+@pytest.mark.parametrize("path", ["//[", "/?token=%ff", "/?token=\udcff", "http://[", "/#a"])
+@pytest.mark.parametrize("cookie", ["spadrig-8765=\udcff\udc80", "spadrig-8765=", "\udcff"])
+def test_a_request_of_odd_bytes_is_refused_like_any_other(path: str, cookie: str) -> None:
+    lab = Access("0.0.0.0", 8765, "a-token-that-is-long-enough", frozenset({"localhost"}))
+    refusal = lab.refusal(Asked(path, False, ["localhost"], [], [cookie]))
+    assert refusal is not None
+    assert refusal.status == 401
+
+
+@pytest.mark.parametrize("least", ["9" * 400, "1e999", "-" + "9" * 400])
+def test_a_number_beyond_all_bounds_is_no_wish(least: str) -> None:
+    with pytest.raises(ValueError):
+        PageWish.parse(1, f'{{"ask": "confidence", "least": {least}}}')
