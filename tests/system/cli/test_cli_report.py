@@ -122,7 +122,7 @@ def test_a_trade_off_has_the_page_that_it_wrote_itself(rig: Rig, small: Path) ->
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("gone",), "gone does not exist; name the folder of a run, a calibration or a trade-off"),
+        (("gone",), "gone does not exist; name the folder of a run, a calibration, a trade-off or a study"),
         (("empty",), "empty holds no run, no calibration, no trade-off and no study; name the folder"),
         (("notes.txt",), "notes.txt is a file; name the folder"),
         (("RUN", "empty"), "empty holds no run"),
