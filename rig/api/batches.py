@@ -98,7 +98,7 @@ def batch(
         done = run_batch(
             store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
         )  # fmt: skip
-        if done.verdict != "part":
+        if done.packed:
             _write_tables(store, made, done.verdict == "aborted")
     return BatchResult(done, folder)
 

@@ -6,7 +6,9 @@ when a case hangs or takes too much memory. A worker with another version of the
 as soon as it shows; its cases go to others.
 """
 
+import contextlib
 import logging
+import os
 import socket
 import threading
 import time
@@ -133,6 +135,7 @@ class Cluster:
         if note not in self.notes:
             self.notes.append(note)
             _log.warning("%s", note)
+        with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
             self._client.retire_workers([ended.worker.partition(" ")[0]], close_workers=True)
         return Ended(ended.name, "lost", note)
 
@@ -206,9 +209,12 @@ def _on_worker(task: Task, limits: Limits) -> Ended:
     from distributed import get_worker
 
     name = f"{get_worker().address} {socket.gethostname()}"
-    pool = getattr(_of_thread, "pool", None)
-    if pool is None:
-        pool = _of_thread.pool = Pool(1, limits, name)
+    pool, its_limits = getattr(_of_thread, "pool", (None, None))
+    if pool is None or its_limits != limits:  # the first task, or the first of another study
+        if pool is not None:
+            pool.close()
+        pool = Pool(1, limits, name)
+        _of_thread.pool = pool, limits
     pool.submit(task)
     while not (ended := pool.wait()):
         pass
@@ -216,7 +222,10 @@ def _on_worker(task: Task, limits: Limits) -> Ended:
 
 
 def _lost(name: str, future: "Future[Any]") -> Ended:
-    error = future.exception(timeout=1) if future.status == "error" else None
+    error = None
+    if future.status == "error":
+        with contextlib.suppress(OSError, TimeoutError):
+            error = future.exception(timeout=1)
     return Ended(name, "lost", f"its worker is gone ({future.status if error is None else error})")
 
 
@@ -245,6 +254,8 @@ def _problems(folder: str, head: str, files: Mapping[str, str], codes: Mapping[s
             seen = ""
         if seen != wanted:
             problems.append(f"does not see {what}; share it under the same path, with the same content")
+    if os.path.isdir(folder) and not os.access(folder, os.W_OK):
+        problems.append(f"cannot write {folder}; share it for writing")
     if any(code_digest(package) != code for package, code in codes.items()):
         problems.append("has another version of the code or of its packages; install the same one")
     return problems

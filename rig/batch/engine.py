@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, Protocol
 
-from rig.batch.store import FAILURES, Store
+from rig.batch.store import FAILURES, Store, failure_files
 from rig.batch.task import Ended, Status, Task
 from rig.errors import UsageError
 from rig.progress import Progress, tell_stage
@@ -75,7 +75,8 @@ class Batch:
     """Result of a batch. done: cases in the table, of `total`; run: those that were done now. workers: most at once.
 
     verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, whose other cases are done elsewhere),
-    'stopped' (results could not be written any more; `reason` says why), or 'aborted' by an interrupt.
+    'stopped' (results could not be written any more, or the code has changed; `reason` says why), or 'aborted' by an
+    interrupt. packed: whether the table has been written; of several shards the last one does it.
     """
 
     done: int
@@ -88,6 +89,7 @@ class Batch:
     case_s: float = 0.0
     workers: int = 0
     notes: tuple[str, ...] = ()
+    packed: bool = True
 
 
 def run_batch(
@@ -118,10 +120,17 @@ def run_batch(
         aborted = True
     finally:
         executor.close()
-        if shard[1] == 1 or (len(store.finished()) == len(store.cases) and store.alone()):
-            done = store.pack()
-        else:
-            done = len(store.finished())
+        there = store.finished()
+        done, total = len(there), len(store.cases)
+        packed = shard[1] == 1 or (done == total and store.alone())
+        if packed:
+            try:
+                store.pack()
+            except OSError as error:
+                packed = False
+                runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
+    for name in runs.done - there:
+        runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
     failures = tuple(
         Failure(
             end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.attempts[end.name],
@@ -129,14 +138,14 @@ def run_batch(
         )
         for end in runs.failed.values()
     )  # fmt: skip
-    file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0]}-of-{shard[1]}.jsonl")
+    file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0] + 1}-of-{shard[1]}.jsonl")
     with contextlib.suppress(OSError):  # the disk is full: they are returned all the same
-        file.unlink(missing_ok=True)
+        for old in failure_files(store.folder) if packed else [file]:
+            old.unlink(missing_ok=True)
         if failures:
             replace_file(file, "".join(json_line(asdict(failure)) for failure in failures).encode())
     if aborted and not done:
         raise KeyboardInterrupt
-    total = len(store.cases)
     verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
     if aborted:
         verdict = "aborted"
@@ -145,10 +154,10 @@ def run_batch(
     elif failures:
         verdict = "failures"
     else:
-        verdict = "complete" if done == total else "part"
+        verdict = "complete" if packed else "part"
     return Batch(
-        done, total, runs.done, failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s), runs.most,
-        tuple(executor.notes),
+        done, total, len(runs.done), failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
+        runs.most, tuple(executor.notes), packed,
     )  # fmt: skip
 
 
@@ -162,7 +171,7 @@ class _Runs:
         self.attempts: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
         self.failed: dict[str, Ended] = {}
-        self.done = 0
+        self.done: set[str] = set()
         self.times_s: list[float] = []
         self.most = 0
         self.stopped = ""
@@ -192,14 +201,16 @@ class _Runs:
             self.attempts[name] += 1
             again = ended.status in ("died", "hung", "memory") and self.attempts[name] <= self._retries
         if ended.status == "done":
-            self.done += 1
-            self.failed.pop(name, None)
+            self.done.add(name)
         elif again:
             self.waiting.append(name)
         else:
             self.failed[name] = ended
-            if ended.status == "cannot write":
-                self.stopped = f"{ended.message}; make room, then run it again"
+            self.stopped = {
+                "cannot write": f"{ended.message}; make room, then run it again",
+                "other code": "the code has been changed since the batch began; name a new folder",
+                "no folder": ended.message,
+            }.get(ended.status, self.stopped)
 
 
 class _Told:
@@ -217,8 +228,8 @@ class _Told:
         if now_s - self._said_s < SAID_S and not over:
             return
         self._said_s = now_s
-        done = self._before + runs.done
-        ended = runs.done + len(runs.failed)
+        done = self._before + len(runs.done)
+        ended = len(runs.done) + len(runs.failed)
         notes = []
         if ended and not over:
             left_s = (now_s - self._begun_s) / ended * (len(runs.waiting) + len(runs.under_way))
@@ -249,7 +260,7 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> float:
     runs = _Runs(scratch, executor, some, 0)
     try:
         for _ in runs.steps():
-            tell_stage("trying cases", runs.done, len(some), "done")
+            tell_stage("trying cases", len(runs.done), len(some), "done")
     finally:
         executor.close()
     if runs.failed:

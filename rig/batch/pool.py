@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import selectors
+import signal
 import subprocess
 import sys
 import tempfile
@@ -21,6 +22,8 @@ from rig.batch.task import Ended, Status, Task
 
 LOOK_S: Final = 0.2
 """Seconds from one look at memory and time to the next."""
+START_S: Final = 300.0
+"""Longest time in which a process starts. It does not count as the case's: imports may take seconds on a busy disk."""
 USUAL_BYTES: Final = 2 << 30
 """Memory of a case, if nobody says how much it needs: there are no more workers than have room for it."""
 KEPT_FREE: Final = 0.1
@@ -120,6 +123,7 @@ class _Process:
         self._task: Task | None = None
         self._begun_s = 0.0
         self._part = b""
+        self._ready = False
         self.alive = True
         path = os.pathsep.join(each or os.getcwd() for each in sys.path)
         # A session of its own: Ctrl-C at the terminal is for the process that started this one.
@@ -142,22 +146,26 @@ class _Process:
             pass
 
     def answer(self) -> Ended | None:
-        """The end of the task, once the process has said or died; None if only a part of the line is there."""
+        """The end of the task, once the process has said or died; None if only a part of the line is there, or if the
+        process has just become ready."""
         data = os.read(self.answers.fileno(), 1 << 16)
         if not data:
             self._process.wait()
             return self._end("died", f"the process ended with {_in_words(self._process.returncode)}")
-        self._part += data
-        if not self._part.endswith(b"\n"):
-            return None
-        line, self._part = self._part, b""
-        return Ended(**json.loads(line))
+        *lines, self._part = (self._part + data).split(b"\n")
+        for line in lines:
+            if line:
+                return Ended(**json.loads(line))
+            self._ready = True
+            self._begun_s = time.monotonic()
+        return None
 
     def overdrawn(self) -> Ended | None:
         """The end of a task that has taken too long or too much memory; None if it has not."""
         limits = self._limits
-        if time.monotonic() - self._begun_s > limits.time_s:
-            return self._end("hung", f"the case took longer than {limits.time_s:g} s")
+        longest_s = limits.time_s if self._ready else START_S
+        if time.monotonic() - self._begun_s > longest_s:
+            return self._end("hung", f"the {'case' if self._ready else 'process'} took longer than {longest_s:g} s")
         assert limits.memory_bytes is not None, "the pool has set it"
         used = resident_bytes(self._process.pid)
         if used > limits.memory_bytes:
@@ -165,8 +173,11 @@ class _Process:
         return None
 
     def kill(self) -> None:
-        """End the process at once."""
+        """End the process at once, and those that its case has started."""
         self.alive = False
+        if hasattr(os, "killpg"):
+            with contextlib.suppress(OSError):  # all of them have ended
+                os.killpg(self._process.pid, signal.SIGKILL)
         self._process.kill()
         self._process.wait()
         for stream in (self._stdin, self.answers, self._printed):

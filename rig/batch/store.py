@@ -15,13 +15,14 @@ was interrupted.
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
 from rig.batch.case import MEASURED, Case, checksum, code_digest, numeric_versions, package_of
-from rig.batch.task import CASE, CASES, HEAD, RESULT, Task, read_result, result_file
+from rig.batch.task import CASE, CASES, HEAD, RESULT, Task, read_result
 from rig.errors import UsageError
 from rig.run_folder.disk import hold, replace_file, sync_folder
 from rig.run_folder.plain_json import json_line, json_text
@@ -32,6 +33,11 @@ TABLE: Final = "table.jsonl"
 MEASUREMENTS: Final = "measured.jsonl"
 FAILURES: Final = "failures.jsonl"
 LOCK: Final = ".lock"
+SHARDS_WAIT_S: Final = 60.0
+"""Longest time that a shard waits for another one which begins the folder, or writes the table."""
+LOCK_LOOK_S: Final = 0.05
+_BEGUN: Final = {LOCK, LIST, f"{LIST}.part", f"{HEAD}.part"}
+"""Files in the folder of a batch that was ended before its first case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,19 +105,38 @@ class Store:
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"`out={folder}` is a file; name a new folder")
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / HEAD).exists() and any(each.name != LOCK for each in folder.iterdir()):
+        there = {each.name for each in folder.iterdir()}
+        if HEAD not in there and there - (_BEGUN if LOCK in there else set()):
             raise UsageError(f"`out={folder}` has something else in it; name a new folder, or that of the same study")
         self._lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
-        try:
-            hold(self._lock, shared=shared)
-        except OSError as error:
-            raise UsageError(f"another process is at work in {folder}; wait until it has ended") from error
+        self._hold(shared)
         if (folder / HEAD).exists():
             self._require_same(lines)
         else:
             replace_file(folder / LIST, lines.encode())
             replace_file(folder / HEAD, (json_text(self.head) + "\n").encode())
         (folder / CASES).mkdir(exist_ok=True)
+        if shared:
+            self._hold(shared, begun=True)
+
+    def _hold(self, shared: bool, begun: bool = False) -> None:
+        """Lock the folder. Raises UsageError if another process is at work in it.
+
+        Of several shards that start at once, one alone begins the folder; the others wait for it. Where the file system
+        has no locks, nothing is locked: results are right nevertheless.
+        """
+        until_s = time.monotonic() + (SHARDS_WAIT_S if shared else 0.0)
+        while True:
+            for as_shared in (True,) if begun else (False, True) if shared else (False,):
+                try:
+                    return hold(self._lock, shared=as_shared)
+                except BlockingIOError:
+                    pass
+                except OSError:
+                    return None
+            if time.monotonic() >= until_s:
+                raise UsageError(f"another process is at work in {self.folder}; wait until it has ended")
+            time.sleep(LOCK_LOOK_S)
 
     def _require_same(self, lines: str) -> None:
         """Raise UsageError if the folder has been begun with other cases, or with other code."""
@@ -141,18 +166,15 @@ class Store:
     def finished(self) -> set[str]:
         """Names of the cases that have a result. Files that a loss of power has torn are removed."""
         found = {row.case for row in self.rows()}
-        for file in (self.folder / CASES).glob("*/*.json"):
-            if file.stem not in found and file.stem in self.cases:
+        for name, file in _results(self.folder).items():
+            # Read again: another shard may have written it since.
+            if name not in found and name in self.cases and read_result(file, name) is None:
                 file.unlink(missing_ok=True)
         return found
 
     def rows(self) -> Iterator[Row]:
         """All finished cases, in order."""
         return read_rows(self.folder)
-
-    def done(self, name: str) -> bool:
-        """Whether a result of a case has been written since the last `pack`."""
-        return result_file(self.folder, name).exists()
 
     def pack(self) -> int:
         """Write the table with all results that there are, and return their number. Raises OSError."""
@@ -189,18 +211,30 @@ def read_rows(folder: Path) -> Iterator[Row]:
         raise UsageError(f"{folder} has no study; name the folder that `rig batch` wrote") from error
     packed = {each[CASE]: each for each in _lines(folder / TABLE) if CASE in each}
     measured = {each[CASE]: each[MEASURED] for each in _lines(folder / MEASUREMENTS)}
+    files = _results(folder)
     for line in listed:
         case = json.loads(line)
         name = case[CASE]
         if name in packed:
             yield Row(name, case["labels"], packed[name][RESULT], measured.get(name, {}))
-        elif (found := read_result(result_file(folder, name), name)) is not None:
+        elif name in files and (found := read_result(files[name], name)) is not None:
             yield Row(name, case["labels"], found[RESULT], found[MEASURED])
+
+
+def _results(folder: Path) -> dict[str, Path]:
+    """Files of results by the names of their cases. A shared folder shows new files sooner when it is listed than when
+    they are asked for by name."""
+    return {file.stem: file for file in (folder / CASES).glob("*/*.json")}
 
 
 def read_failures(folder: Path) -> list[dict[str, Any]]:
     """The cases that failed, as `rig.batch.engine.Failure` has them: those of all shards."""
-    return [line for file in sorted(folder.glob("failures*.jsonl")) for line in _lines(file)]
+    return [line for file in failure_files(folder) for line in _lines(file)]
+
+
+def failure_files(folder: Path) -> list[Path]:
+    """The files with failures: one, or one for each shard that had some."""
+    return sorted(folder.glob("failures*.jsonl"))
 
 
 def _lines(file: Path) -> Iterator[dict[str, Any]]:

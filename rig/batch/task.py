@@ -31,7 +31,7 @@ Status = Literal["done", "raised", "died", "hung", "memory", "cannot write", "ot
 """How a case ended. died: its process ended; hung: it took too long; memory: it took too much; other code, no folder:
 the worker has another version of the code, or does not see the folder; lost: the connection to the worker broke."""
 
-_NO_SPACE: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOENT, errno.EIO}
+_NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +80,21 @@ def perform(task: Task, worker: str = "") -> Ended:
         shutil.rmtree(inputs["keep"], ignore_errors=True)  # of an attempt that was interrupted
     try:
         result = dict(call(task.function, inputs))
+        seconds = time.monotonic() - begun
+        measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
+        line = json_line({CASE: task.name, RESULT: result, MEASURED: measured})
     except MemoryError:
         return Ended(task.name, "memory", "the case ran out of memory", traceback.format_exc(), worker=worker)
     except Exception as error:
         said = " ".join(str(error).split()) or "no message"
         message = f"{type(error).__name__}: {said}"
-        return Ended(task.name, "raised", message, traceback.format_exc(), time.monotonic() - begun, worker)
-    seconds = time.monotonic() - begun
-    measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
+        # A full disk is no fault of the case: all others that write files would fail as well.
+        full = isinstance(error, OSError) and error.errno in _NO_ROOM
+        status: Status = "cannot write" if full else "raised"
+        return Ended(task.name, status, message, traceback.format_exc(), time.monotonic() - begun, worker)
     try:
-        write_once(file, json_line({CASE: task.name, RESULT: result, MEASURED: measured}))
+        write_once(file, line)
     except OSError as error:
-        if error.errno not in _NO_SPACE:
-            raise
         said = f"cannot write {file}: {error.strerror}"
         return Ended(task.name, "cannot write", said, seconds=seconds, worker=worker)
     return Ended(task.name, "done", seconds=seconds, worker=worker)

@@ -1,7 +1,8 @@
 """The process that does cases one after the other: `python -m rig.batch.worker`, started by `rig.batch.pool`.
 
-It reads tasks from its standard input and writes how they ended to its standard output, a line of JSON each. When the
-input ends, because the process that started it is gone, it ends at once, also in the middle of a case.
+It reads tasks from its standard input and writes how they ended to its standard output, a line of JSON each, after an
+empty line once it is ready. When the input ends, because the process that started it is gone, it ends at once, also in
+the middle of a case.
 """
 
 import json
@@ -23,6 +24,8 @@ def main() -> None:
     lines: SimpleQueue[str] = SimpleQueue()
     threading.Thread(target=_read, args=(lines,), daemon=True).start()
     prepare_kernels()
+    answers.write("\n")
+    answers.flush()
     while True:
         ended = perform(Task(**json.loads(lines.get())), sys.argv[1])
         answers.write(json_line(asdict(ended)))

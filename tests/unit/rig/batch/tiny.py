@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -30,3 +31,35 @@ def trouble(x: int, kind: str, counter: str, times: int = 10**9) -> dict[str, An
                 eaten.append(bytearray(20 << 20))
                 time.sleep(0.01)
     return {"y": x * x}
+
+
+def nothing() -> None:
+    """A case that forgets its result."""
+
+
+def keeping(x: int, keep: str) -> dict[str, Any]:
+    """A case that keeps a file."""
+    Path(keep).mkdir(parents=True)
+    (Path(keep) / "map.txt").write_text(str(x))
+    return {"y": x}
+
+
+def environment(x: int) -> dict[str, Any]:
+    """A case that looks at its process."""
+    return {"threads": os.environ["OPENBLAS_NUM_THREADS"], "measured": {"pid": os.getpid()}}
+
+
+def loud(x: int, die: bool) -> dict[str, Any]:
+    """A case that prints."""
+    print(f"a line of {x}", flush=True)
+    if die:
+        os._exit(7)
+    return {"y": x}
+
+
+def parent(file: str) -> dict[str, Any]:
+    """A case that waits for a process of its own."""
+    with subprocess.Popen(["sleep", "1000"]) as child:
+        Path(file).write_text(str(child.pid))
+        child.wait()
+    return {}

@@ -1,0 +1,106 @@
+"""A case has one name on all computers, and another one if anything changes on which its result depends."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers.recorded.contents import INDEX_FILE
+from rig.batch import case as module
+from rig.batch.case import Case, call, checksum, code_digest, package_of
+from rig.errors import UsageError
+from tests.unit.rig.batch.executors import TINY
+
+SQUARE = Case(f"{TINY}:square", {"x": 3, "sleep_s": 0.0}, {"x": 3})
+
+
+def test_a_name_does_not_depend_on_the_order_of_inputs_or_on_labels() -> None:
+    same = Case(f"{TINY}:square", {"sleep_s": 0.0, "x": 3}, {"another": "label"})
+    assert SQUARE.name("code", {}) == same.name("code", {})
+
+
+def test_a_name_changes_with_function_input_code_and_contents_of_files() -> None:
+    with_file = Case(SQUARE.function, SQUARE.inputs, files=("/f",))
+    names = {
+        SQUARE.name("code", {}),
+        SQUARE.name("other code", {}),
+        Case(f"{TINY}:trouble", SQUARE.inputs).name("code", {}),
+        Case(SQUARE.function, {"x": 4, "sleep_s": 0.0}).name("code", {}),
+        with_file.name("code", {"/f": "a"}),
+        with_file.name("code", {"/f": "b"}),
+    }
+    assert len(names) == 6
+    assert {len(name) for name in names} == {module.NAME_DIGITS}
+
+
+def test_a_case_is_called_by_name_and_must_return_a_mapping() -> None:
+    assert SQUARE.call()["y"] == 9
+    with pytest.raises(TypeError, match=r"builtins:list returned list; the result of a case is a mapping"):
+        call("builtins:list", {})
+
+
+def test_the_checksum_of_a_folder_sees_contents_and_names(tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "b" / "one").write_text("1")
+    seen = [checksum(str(tmp_path / "a"))]
+    (tmp_path / "a" / "b" / "one").write_text("2")
+    seen.append(checksum(str(tmp_path / "a")))
+    (tmp_path / "a" / "b" / "one").rename(tmp_path / "a" / "b" / "two")
+    seen.append(checksum(str(tmp_path / "a")))
+    assert len(set(seen)) == 3
+    (tmp_path / "a").rename(tmp_path / "c")
+    assert checksum(str(tmp_path / "c")) == seen[-1], "the place of the folder does not matter"
+
+
+def test_of_a_recording_the_index_is_read_and_frames_are_only_measured(tmp_path: Path) -> None:
+    (tmp_path / INDEX_FILE).write_text("checksums of all blocks")
+    (tmp_path / "frames.bin").write_text("0000")
+    before = checksum(str(tmp_path))
+    (tmp_path / "frames.bin").write_text("1111")
+    assert checksum(str(tmp_path)) == before
+    (tmp_path / "frames.bin").write_text("111")
+    assert checksum(str(tmp_path)) != before
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot read .*none: No such file or directory; correct the path"):
+        checksum(str(tmp_path / "none"))
+
+
+def test_the_digest_of_the_code_sees_our_sources_and_those_of_the_cases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "TOP", tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for package in ("rig", "lab_of_mine"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("")
+    (tmp_path / "single.py").write_text("")
+    seen = {}
+
+    def look() -> dict[str, str]:
+        code_digest.cache_clear()
+        return {name: code_digest(name) for name in ("rig", "lab_of_mine", "single")}
+
+    try:
+        seen = look()
+        assert look() == seen
+        assert len(set(seen.values())) == 3
+        (tmp_path / "lab_of_mine" / "more.py").write_text("x = 1")
+        now = look()
+        assert {name for name in seen if now[name] != seen[name]} == {"lab_of_mine"}
+        (tmp_path / "rig" / "table.yaml").write_text("x: 1")
+        assert {name for name in seen if look()[name] != now[name]} == {"rig", "lab_of_mine", "single"}
+        (tmp_path / "rig" / "__pycache__").mkdir()
+        now = look()
+        (tmp_path / "rig" / "__pycache__" / "left.py").write_text("x = 1")
+        (tmp_path / "rig" / "notes.txt").write_text("not code")
+        assert look() == now
+        monkeypatch.setattr(module, "version", lambda name: "0.0.1")
+        assert set(look().values()).isdisjoint(now.values())
+    finally:
+        code_digest.cache_clear()
+
+
+def test_the_package_of_a_function_is_the_first_part_of_its_name() -> None:
+    assert package_of("rig.api.batch_cases:scan_once") == "rig"
+    assert package_of("single:main") == "single"
