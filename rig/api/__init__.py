@@ -25,7 +25,6 @@ require_own_names()  # here too: another package `rig` may have overwritten only
 
 if TYPE_CHECKING:
     from rig.api.as_before import repeat
-    from rig.api.batches import BatchPlan, BatchResult, batch, plan_batch, repeat_case
     from rig.api.demo import Demonstration, demonstrate
     from rig.api.example import ExampleRecording, example_recording
     from rig.api.past_runs import runs
@@ -33,9 +32,10 @@ if TYPE_CHECKING:
     from rig.api.reports import ReportResult, report
     from rig.api.rig import bench, check_config, devices, doctor, laser_off, warm_up
     from rig.api.scans import plan_scan, reconstruct, replay, scan
-    from rig.api.split import reconstruct_parts
     from rig.api.steering import OnMap, SeenMap
     from rig.api.strategies import compare_strategies
+    from rig.api.studies.batches import BatchPlan, BatchResult, batch, plan_batch, repeat_case
+    from rig.api.studies.parts import reconstruct_parts
     from rig.api.tradeoffs import tradeoff
     from rig.bench.soak import soak
     from rig.calibrate.align import align
@@ -154,7 +154,7 @@ __all__ = [
 
 _HOMES: Final = {
     "rig.api.as_before": ("repeat",),
-    "rig.api.batches": ("BatchPlan", "BatchResult", "batch", "plan_batch", "repeat_case"),
+    "rig.api.studies.batches": ("BatchPlan", "BatchResult", "batch", "plan_batch", "repeat_case"),
     "rig.api.demo": ("Demonstration", "demonstrate"),
     "rig.api.example": ("ExampleRecording", "example_recording"),
     "rig.api.region_quality": ("quality",),
@@ -162,7 +162,7 @@ _HOMES: Final = {
     "rig.api.rig": ("bench", "check_config", "devices", "doctor", "laser_off", "warm_up"),
     "rig.api.past_runs": ("runs",),
     "rig.api.scans": ("plan_scan", "reconstruct", "replay", "scan"),
-    "rig.api.split": ("reconstruct_parts",),
+    "rig.api.studies.parts": ("reconstruct_parts",),
     "rig.api.steering": ("OnMap", "SeenMap"),
     "rig.api.strategies": ("compare_strategies",),
     "rig.api.tradeoffs": ("tradeoff",),

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.files.npy_files import load_array
 from rig.config.overrides import PathLike
 from rig.depth.quality import RegionQuality, RegionTally
 from rig.errors import DamagedRecordingError, UsageError
@@ -68,7 +69,7 @@ def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQ
 def _map_of(folder: Path, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Depth (rows, width) of a map, and points (n, 3) of its pixels with depth, row by row."""
     try:
-        depth_m = np.load(file, allow_pickle=False)
+        depth_m = load_array(file)
         points = ply_points((folder / "cloud" / f"{file.stem}.ply").read_bytes())
     except (OSError, ValueError) as error:
         raise DamagedRecordingError(

@@ -25,7 +25,7 @@ _WHAT: Final = "name the folder of a run, a calibration, a trade-off or a study,
 
 @dataclass(frozen=True, slots=True)
 class ReportResult:
-    """A report that was written. kind: run, runs, calibration, tradeoff or study. missing: sentences on what it lacks."""
+    """A written report. kind: run, runs, calibration, tradeoff or study. missing: sentences on what it lacks."""
 
     file: Path
     kind: str
@@ -43,8 +43,8 @@ def report(
     beside the folder or file. An older report is replaced. map: number of the map that is shown; None: the last one.
     Whatever is missing in a run is named in the page.
 
-    Raises UsageError for anything else than a run, a calibration, a trade-off or a study, for a map that is not there, and if
-    the file cannot be written.
+    Raises UsageError for anything else than a run, a calibration, a trade-off or a study, for a map that is not there,
+    and if the file cannot be written.
     """
     folder, second = Path(run), None if other is None else Path(other)
     kind = _kind(folder)

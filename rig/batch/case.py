@@ -31,7 +31,7 @@ MEASURED: Final = "measured"
 NAME_DIGITS: Final = 24
 
 Result = Mapping[str, Any]
-"""What the function of a case returns."""
+"""The values that the function of a case returns."""
 
 
 @dataclass(frozen=True, slots=True)

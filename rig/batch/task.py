@@ -28,7 +28,7 @@ CASE: Final = "case"
 RESULT: Final = "result"
 
 Status = Literal["done", "raised", "died", "hung", "memory", "cannot write", "other code", "no folder", "lost"]
-"""How a case ended. died: its process ended; hung: it took too long; memory: it took too much; other code, no folder:
+"""The end of a case. died: its process ended; hung: it took too long; memory: it took too much; other code, no folder:
 the worker has another version of the code, or does not see the folder; lost: the connection to the worker broke."""
 
 _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
@@ -53,7 +53,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a task ended. message: one line. detail: the trace of an error. seconds: wall time of the case."""
+    """The end of a task. message: one line. detail: the trace of an error. seconds: wall time of the case."""
 
     name: str
     status: Status

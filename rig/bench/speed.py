@@ -91,7 +91,7 @@ class Extent:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class MeasuredCase:
     """A row that is to be measured. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
 
     stage: str
@@ -241,16 +241,16 @@ def _cases(
     exposures: Iterable[int],
     workers: Workers,
     make: Callable[[int, RowWorkers], Stage],
-) -> list[Case]:
+) -> list[MeasuredCase]:
     """A stage at these numbers of exposures and of threads."""
     return [
-        Case(stage, frames.window, k, n, frames.frame_bytes, make(k, own))
+        MeasuredCase(stage, frames.window, k, n, frames.frame_bytes, make(k, own))
         for k in exposures
         for n, own in workers.items()
     ]
 
 
-def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent) -> list[Case]:
+def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent) -> list[MeasuredCase]:
     """The rows of every window."""
     walk, one = Walk(frames), {1: workers[1]}
     every = sorted({*COUNT_EXPOSURES, *extent.exposures})
@@ -269,7 +269,7 @@ def _window_cases(frames: BenchFrames, learned: Likelihood, workers: Workers, ex
 
 def _usual_cases(
     frames: BenchFrames, learned: Likelihood, workers: Workers, extent: Extent, folder: Path
-) -> list[Case]:
+) -> list[MeasuredCase]:
     """The rows of the usual window only, all of `likelihood`: with whole sweeps, with whole frames, with frames from a
     recording."""
     few = [k for k in FEW_EXPOSURES if k in extent.exposures]
@@ -290,25 +290,25 @@ def _usual_cases(
     ]
 
 
-def _map_cases(workers: Workers, extent: Extent) -> list[Case]:
+def _map_cases(workers: Workers, extent: Extent) -> list[MeasuredCase]:
     """The rows of whole maps."""
     surface = bench_surface(extent.map_rows, extent.map_columns)
     most, window = max(workers), WINDOWS[0]
     model = stages.learn_joint(surface, LEARN_EXPOSURES, most)
-    cases = [Case("sgbm", window, None, n, None, stages.sgbm_stage(surface, n)) for n in workers]
+    cases = [MeasuredCase("sgbm", window, None, n, None, stages.sgbm_stage(surface, n)) for n in workers]
     for k in MAP_EXPOSURES:
         bits = surface.frames(k, workers[most])
         volume = count_surface(surface, bits, k, workers[most])
         for n in workers:
-            cases.append(Case("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)))
+            cases.append(MeasuredCase("joint", window, k, n, None, stages.joint_stage(surface, volume, n, model)))
             if k in SWEEP_EXPOSURES:
                 sweep = stages.joint_sweep_stage(surface, bits, k, n, model)
-                cases.append(Case("joint-sweep", window, k, n, None, sweep))
+                cases.append(MeasuredCase("joint-sweep", window, k, n, None, sweep))
     return cases
 
 
 def _in_turn(
-    cases: list[Case], frames: BenchFrames, extent: Extent, progress: Progress | None
+    cases: list[MeasuredCase], frames: BenchFrames, extent: Extent, progress: Progress | None
 ) -> tuple[list[float], list[list[Measured]]]:
     """Bytes a second of each reading of the memory, and the result of each case in each round."""
     # Memory of its own with the bits of frames: pages of zeros would be read from a cache.
@@ -335,7 +335,7 @@ def _read_bytes_per_s(words: NDArray[np.uint64]) -> float:
     return words.nbytes / (time.perf_counter() - begun)
 
 
-def _rows(cases: Sequence[Case], measured: Sequence[Sequence[Measured]], read: float) -> tuple[SpeedRow, ...]:
+def _rows(cases: Sequence[MeasuredCase], measured: Sequence[Sequence[Measured]], read: float) -> tuple[SpeedRow, ...]:
     speeds = [_median(each.frames / each.seconds for each in these) or None for these in measured]
     naive = {
         (case.window, case.exposures): speed for case, speed in zip(cases, speeds, strict=True) if case.stage == "numpy"

@@ -12,7 +12,7 @@ from rig.errors import UsageError
 from rig.requests import BatchRequest, SoakRequest
 
 if TYPE_CHECKING:
-    from rig.api.batches import BatchPlan, BatchResult
+    from rig.api.studies.batches import BatchPlan, BatchResult
     from rig.batch.case import Result
 
 MOST_FAILURES = 10

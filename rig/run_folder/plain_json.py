@@ -15,7 +15,7 @@ def json_text(content: Mapping[str, Any]) -> str:
 
 
 def json_line(content: Mapping[str, Any]) -> str:
-    """The same on one line, with its end. Keys are sorted, so that the same content is always the same line."""
+    """Content as `json_text` writes it, but on one line. Keys are sorted, so equal content gives equal lines."""
     return json.dumps(plain(content), sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n"
 
 

@@ -16,7 +16,7 @@ from rig.errors import UsageError, noted
 from rig.estimate.registry import FILTERS
 from rig.study.definition import Setting, Study, left_out
 
-ACTIONS: Final = "rig.api.batch_cases"
+ACTIONS: Final = "rig.api.studies.cases"
 _KEY_OF: Final = {
     "scene": "world.scene",
     "fog": "world.fog",
@@ -45,7 +45,7 @@ def cases_of(study: Study) -> list[Case]:
     if problems:
         raise UsageError.of(problems)
     if not cases:
-        raise UsageError("the study has no case: `omit` leaves all of them out")
+        raise UsageError("the study has no case: omit leaves all of them out")
     return cases
 
 
@@ -75,7 +75,7 @@ _COUNTS: Final = "maps", "poses"
 
 def _reconstruct(study: Study, setting: Setting) -> _Inputs:
     if "recording" not in setting:
-        raise UsageError("reconstruct needs the setting `recording`, the folder of a run or an .npy of frames")
+        raise UsageError("reconstruct needs the setting 'recording', the folder of a run or an .npy of frames")
     problems = []
     files = tuple(str(Path(setting[key]).absolute()) for key in ("recording", "plan", "calibration") if key in setting)
     problems += [f"{file} does not exist; correct the path" for file in files if not Path(file).exists()]

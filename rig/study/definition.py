@@ -1,4 +1,4 @@
-"""What a study is: the content of its YAML file, and the combinations of settings that it names."""
+"""A study: the content of its YAML file, and the combinations of settings that it names."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -107,7 +107,7 @@ class Study(BaseModel):
             if key not in known and not (dotted and key.count(".") == 1)
         ]
         if self.do in WHOLE and self.also:
-            problems.append(f"`also` is not for {self.do}, which combines all lists; add the values to `vary`")
+            problems.append(f"also is not for {self.do}, which combines all lists; add its values to vary")
         size = len(self.seeds) * len(self.also)
         combined = len(self.seeds)
         for values in self.vary.values():

@@ -28,7 +28,7 @@ def whole(recording, tmp_path_factory) -> Path:
 
 
 def test_all_files_of_maps_are_the_same_and_so_are_the_figures(recording, whole, tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.api.split.MAPS_OF_A_PART", 2)
+    monkeypatch.setattr("rig.api.studies.parts.MAPS_OF_A_PART", 2)
     result = api.reconstruct_parts(recording, request=api.ReconstructRequest(out=tmp_path / "parts"), workers=2)
     assert result.folder == tmp_path / "parts"
     names = sorted(str(file.relative_to(whole)) for file in whole.glob("*/*"))

@@ -37,7 +37,7 @@ from sim_backend.wire.firmware.helios import BLUE, GREEN, INTENSITY
 from sim_backend.wire.firmware.nidaq_parts import daq_task as ni
 from sim_backend.wire.firmware.nidaq_parts.daq_card import Card
 from sim_backend.wire.firmware.nidaq_parts.daq_outputs import CardHistory
-from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, Task
+from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, DaqTask
 
 MARKERS: Final = {GREEN: "port0/line0", BLUE: "port0/line1", INTENSITY: "port0/line2"}
 """Outputs of the line marker, of the scan marker, and of the level that is high while the mirror goes backward."""
@@ -126,12 +126,12 @@ class NidaqModel(Card):
         """Note the name of a call."""
         self.calls = [*self.calls[-_KEPT_CALLS:], rpc]
 
-    def _task(self, fields: Any) -> Task:
+    def _task(self, fields: Any) -> DaqTask:
         if fields.task not in self.tasks:
             raise DaqmxError(-200088)
         return self.tasks[fields.task]
 
-    def _report(self, task: Task) -> None:
+    def _report(self, task: DaqTask) -> None:
         """Raise the error that ended the generation, if any. It is forgotten once it is raised for a stopped task."""
         error = task.error
         if task.state != ni.RUNNING:
@@ -146,7 +146,7 @@ class NidaqModel(Card):
         if not name:
             name, self._unnamed = f"_unnamedTask<{self._unnamed:X}>", self._unnamed + 1
         new = name not in self.tasks
-        self.tasks.setdefault(name, Task(name))
+        self.tasks.setdefault(name, DaqTask(name))
         return {"task": name, "new_session_initialized": new}
 
     def _clear_task(self, call: Call, fields: Any, now_s: float) -> Answer:
@@ -242,7 +242,7 @@ class NidaqModel(Card):
             raise DaqmxError(code, f"Property: {number:#x}. {of}")
         return values[number]
 
-    def _of_timing(self, task: Task) -> dict[int, Any]:
+    def _of_timing(self, task: DaqTask) -> dict[int, Any]:
         self.verify(task)
         if not task.buffered:
             return {}
@@ -255,7 +255,7 @@ class NidaqModel(Card):
             0x18EB: divisor,
         }
 
-    def _of_task(self, task: Task, rpc: str, now_s: float) -> dict[int, Any]:
+    def _of_task(self, task: DaqTask, rpc: str, now_s: float) -> dict[int, Any]:
         if rpc.startswith("GetWrite"):
             self._report(task)
         generated = task.generated(now_s)
@@ -300,7 +300,7 @@ class NidaqModel(Card):
         rows = [words >> int(one.rpartition("line")[2]) & 1 for one in task.outputs]
         return self._write(call, task, np.array(rows, np.uint8), fields, now_s)
 
-    def _writable(self, fields: Any, kind: str) -> tuple[Task, NDArray[Any]]:
+    def _writable(self, fields: Any, kind: str) -> tuple[DaqTask, NDArray[Any]]:
         """The task of a write, and its numbers."""
         task = self._task(fields)
         self._report(task)
@@ -308,7 +308,7 @@ class NidaqModel(Card):
             raise DaqmxError(-200524, f"Samples: {fields.write_array.size}. Task Name: {task.name}")
         return task, fields.write_array
 
-    def _write(self, call: Call, task: Task, rows: NDArray[Any], fields: Any, now_s: float) -> Answer | None:
+    def _write(self, call: Call, task: DaqTask, rows: NDArray[Any], fields: Any, now_s: float) -> Answer | None:
         """Take samples, (outputs, n): at once, or as there is room for them. None: not all are taken yet."""
         before, n = task.state, rows.shape[1]
         if not task.buffered:
@@ -333,7 +333,7 @@ class NidaqModel(Card):
             self.start(task, now_s, before)
         return {"samps_per_chan_written": n}
 
-    def _write_over(self, task: Task, rows: NDArray[Any], now_s: float) -> None:
+    def _write_over(self, task: DaqTask, rows: NDArray[Any], now_s: float) -> None:
         """Replace samples of the buffer that is regenerated. What the card's memory holds comes out as it was."""
         n, size = rows.shape[1], task.size
         if n > size:
@@ -344,7 +344,7 @@ class NidaqModel(Card):
         if task.edges is not None:
             self.lay(task, task.generated(now_s) + ni.FIFO[task.kind])
 
-    def _append(self, call: Call, task: Task, rows: NDArray[Any], timeout_s: float, now_s: float) -> bool:
+    def _append(self, call: Call, task: DaqTask, rows: NDArray[Any], timeout_s: float, now_s: float) -> bool:
         """Add samples that come out once, as many as there is room for; returns whether all of them are in."""
         room = task.size + ni.FIFO[task.kind] - (task.written - task.generated(now_s))
         if task.state != ni.RUNNING and rows.shape[1] > room:

@@ -8,7 +8,7 @@ import numpy as np
 from sim_backend.wire.firmware.helios import KEEP_S
 from sim_backend.wire.firmware.nidaq_parts import daq_task as ni
 from sim_backend.wire.firmware.nidaq_parts.daq_outputs import EARLY, Edges, Output, Samples
-from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, Task, expand
+from sim_backend.wire.firmware.nidaq_parts.daq_task import DaqmxError, DaqTask, expand
 
 START_DELAY_TICKS: Final = 2
 """Ticks of the timebase between a start trigger and the first edge of the sample clock (X Series User Manual, 5-9)."""
@@ -27,14 +27,14 @@ class Card:
         """clock_error: of the crystal, relative."""
         counts = {"ao": ni.AO_CHANNELS, "port0/line": ni.LINES, "ctr": ni.COUNTERS}
         self.outputs = {f"{kind}{n}": Output() for kind, count in counts.items() for n in range(count)}
-        self.tasks: dict[str, Task] = {}
+        self.tasks: dict[str, DaqTask] = {}
         self._tick_s = 1 / ni.TIMEBASE_HZ / (1 + clock_error)
         self._outside: dict[str, Edges] = {}
 
     def advance(self, now_s: float) -> None:
         """Let everything end that ends by itself until now, in order."""
         while True:
-            task = min(self.tasks.values(), key=Task.ends_s, default=None)
+            task = min(self.tasks.values(), key=DaqTask.ends_s, default=None)
             if task is None or (ends_s := task.ends_s()) > now_s:
                 break
             if task.kind != "co" and not task.regenerates and task.written < task.limit:
@@ -77,7 +77,7 @@ class Card:
             raise DaqmxError(code, f"Terminal: {text}")
         return found[0]
 
-    def source(self, task: Task) -> str:
+    def source(self, task: DaqTask) -> str:
         """Terminal of the clock that a task counts; "" is the card's own clock."""
         if task.source.lower() in ("", "onboardclock"):
             return ""
@@ -106,20 +106,20 @@ class Card:
         if name.lower() != self.name.lower():
             raise DaqmxError(-200220, f"Device: {name}")
 
-    def divisor(self, task: Task) -> int:
+    def divisor(self, task: DaqTask) -> int:
         """Ticks of the timebase from one edge of a task's own clock to the next."""
         return round(ni.TIMEBASE_HZ / task.rate_hz)
 
     # States
 
-    def configure(self, task: Task, **values: Any) -> None:
+    def configure(self, task: DaqTask, **values: Any) -> None:
         """Set properties of a task. Raises DaqmxError while it runs."""
         if task.state == ni.RUNNING:
             raise DaqmxError(-200557, f"Task Name: {task.name}")
         for name, value in values.items():
             setattr(task, name, value)
 
-    def verify(self, task: Task) -> None:
+    def verify(self, task: DaqTask) -> None:
         """Check what a client configured. Raises DaqmxError for the first thing that is wrong."""
         if not task.outputs:
             raise DaqmxError(-200478, f"Task Name: {task.name}")
@@ -142,7 +142,7 @@ class Card:
                 raise DaqmxError(-89136, f"Source: /{self.name}/{known}. Destination: start trigger of {task.name}")
         task.state = max(task.state, ni.VERIFIED)
 
-    def commit(self, task: Task) -> None:
+    def commit(self, task: DaqTask) -> None:
         """Bring a task to the state committed, with all its resources."""
         self.verify(task)
         if task.state >= ni.COMMITTED:
@@ -160,7 +160,7 @@ class Card:
                 raise DaqmxError(-200963, f"Other task: {other.name}. Task Name: {task.name}")
         task.state = ni.COMMITTED
 
-    def start(self, task: Task, now_s: float, before: int) -> None:
+    def start(self, task: DaqTask, now_s: float, before: int) -> None:
         """Start a task, unless it runs. before: the state to which a stop brings it back."""
         if task.state == ni.RUNNING:
             return
@@ -176,7 +176,7 @@ class Card:
         if not task.waiting:
             self._triggered(task, now_s)
 
-    def stop(self, task: Task, now_s: float, state: int = ni.RUNNING) -> None:
+    def stop(self, task: DaqTask, now_s: float, state: int = ni.RUNNING) -> None:
         """Stop a task, if it runs, and bring it back to the state before its start, or to `state` if that is lower."""
         if task.state == ni.RUNNING:
             self._pause(task, now_s)
@@ -190,7 +190,7 @@ class Card:
 
     # Clocks
 
-    def _triggered(self, task: Task, at_s: float) -> None:
+    def _triggered(self, task: DaqTask, at_s: float) -> None:
         task.waiting = False
         self._open(task, at_s)
         if task.kind != "co":
@@ -201,7 +201,7 @@ class Card:
             if other.waiting and self.terminal(other.trigger) == terminal:
                 self._triggered(other, at_s)
 
-    def _open(self, task: Task, at_s: float) -> None:
+    def _open(self, task: DaqTask, at_s: float) -> None:
         """Begin to generate, if the task's clock runs, and let others begin that use the task's clock."""
         source = self.source(task)
         if source:
@@ -220,7 +220,7 @@ class Card:
             if idle and self.source(task) == terminal:
                 self._open(task, at_s)
 
-    def _pause(self, task: Task, at_s: float) -> None:
+    def _pause(self, task: DaqTask, at_s: float) -> None:
         """Generate no more from a time on: the clock stops, the outputs hold, and tasks that use the clock stop too."""
         if task.edges is None:
             return
@@ -232,7 +232,7 @@ class Card:
             if other.edges is not None and self.source(other) == task.terminal:
                 self._pause(other, at_s)
 
-    def lay(self, task: Task, sample: int) -> None:
+    def lay(self, task: DaqTask, sample: int) -> None:
         """Give the outputs of a task with a clock its samples from a number on, in place of what was to come there."""
         assert task.edges is not None, "asked for by the caller"
         if task.kind == "co":

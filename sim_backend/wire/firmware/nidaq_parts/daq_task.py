@@ -79,7 +79,7 @@ def expand(text: str) -> list[str]:
 
 
 @dataclass(eq=False)
-class Task:
+class DaqTask:
     """A task with one channel at most, its data and its generation. Samples are counted from the start on."""
 
     name: str

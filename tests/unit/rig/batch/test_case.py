@@ -102,5 +102,5 @@ def test_the_digest_of_the_code_sees_our_sources_and_those_of_the_cases(
 
 
 def test_the_package_of_a_function_is_the_first_part_of_its_name() -> None:
-    assert package_of("rig.api.batch_cases:scan_once") == "rig"
+    assert package_of("rig.api.studies.cases:scan_once") == "rig"
     assert package_of("single:main") == "single"

@@ -13,7 +13,8 @@ from rig.cli.main import app
 
 ROOT = Path(__file__).parents[4]
 WHOLE_COMMANDS = {
-    "rig/api/reports.py", "rig/live/page.py", "rig/plan/calibration_reach.py", "rig/recording/inputs.py",
+    "rig/api/reports.py", "rig/api/studies/batches.py", "rig/batch/engine.py", "rig/live/page.py",
+    "rig/plan/calibration_reach.py", "rig/recording/inputs.py",
     "rig/recording/open.py", "rig/report/run_settings.py",
 }  # fmt: skip
 """Modules with a whole command line: in a message to be copied, such as `rig reconstruct RUN --out DIR`, or to run."""

@@ -1,4 +1,4 @@
-"""What is done in the cases of a study: functions of plain values that return plain values."""
+"""The functions of the cases of a study. They take plain values and return plain values."""
 
 from collections.abc import Mapping
 from dataclasses import asdict

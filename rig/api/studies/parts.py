@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
-from rig.api.batches import executor_of
 from rig.api.scans import replay
+from rig.api.studies.batches import executor_of
 from rig.batch.case import Case
 from rig.batch.engine import run_batch
 from rig.batch.pool import Limits

@@ -53,7 +53,7 @@ class BatchResult:
 
 @dataclass(frozen=True, slots=True)
 class BatchPlan:
-    """What a study would do. cases, left: of the study, and of those that have no result yet; workers: at once, on this
+    """The work that a study would be. cases, left: of the study, and of those that have no result yet; workers: at once, on this
     computer; case_s: mean wall time of a case in seconds, tried with a few, with one thread; wall_s: of all that are
     left."""
 
@@ -180,7 +180,7 @@ _FIELDS = {
 
 
 def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
-    """What does the cases of a store, as the request says. Raises UsageError."""
+    """The executor that a request asks for, for the cases of a store. Raises UsageError."""
     if client is None and request.cluster in (None, OWN_PROCESSES):
         return Pool(request.workers, limits)
     if request.workers is not None:
