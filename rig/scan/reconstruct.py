@@ -5,6 +5,7 @@ from typing import NamedTuple
 from rig.config.models import EstimateConfig
 from rig.count.sweeps import Gap
 from rig.count.volume import FrameTally, SweepLayout
+from rig.depth.knocks import KnockWatch
 from rig.depth.maps_at_once import MapsAtOnce
 from rig.depth.reconstruct import MapResult, Reconstructor, map_geometry
 from rig.depth.warm_up import warm_up
@@ -51,9 +52,11 @@ def reconstruct_cube(
         told = counted("estimating", "maps", progress)
 
         def deliver(sweep: _CountedMap, result: MapResult) -> None:
+            result = knocks.checked(result)
             run.add(result, sweep.count_s + result.compute_s)
             told(tally.maps, cube.maps)
 
+        knocks = KnockWatch(geometry)
         maps = MapsAtOnce(reconstructor, deliver)
         try:
             for index in range(cube.maps):

@@ -24,6 +24,7 @@ from drivers.spb1 import BlockLayout, frames_per_block
 from rig.config.files import portable_content
 from rig.config.models import AUTO, EstimateConfig
 from rig.count.sweeps import Gap, SweepAccount
+from rig.depth.knocks import KnockWatch
 from rig.depth.reconstruct import Reconstructor, map_geometry
 from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
@@ -145,6 +146,7 @@ def run_scan(
         times=times if isinstance(times, TimeOfDay) else None,
         listeners=listeners,
     )
+    knocks = KnockWatch(geometry if rig.model is not None else None)
     acquisition = Acquisition(rig, plan, timing, reconstructor, asked)
     sweeps: list[SweepAccount] = []
     ended_by: BaseException | None = None
@@ -154,6 +156,7 @@ def run_scan(
                 if times is not None:
                     (taken,) = times.of_maps([_span(found.sweep)])
                     found = replace(found, taken=taken)
+                found = replace(found, result=knocks.checked(found.result))
                 truth = facts.truth(found.sweep, found.column)
                 if kept is not None and not sweeps:
                     used = reconstructor.kept_serves

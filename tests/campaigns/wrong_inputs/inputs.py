@@ -80,7 +80,7 @@ def _spliced(setting: Setting, what: str, after: Path, *, share: float | None = 
 
     def changes(recording: Recording) -> str:
         maps = recording.maps()
-        which = int(setting.rng.integers(len(maps)))
+        which = int(setting.rng.integers(0 if share != 0.0 else 1, len(maps)))
         at = float(setting.rng.uniform(0.2, 0.8)) if share is None else share
         recording.take(Recording(after), slice(int(maps[which][int(at * len(maps[which]))]), None))
         return f"{what} from map {which}, {at:.2f} of its sweep on"
@@ -245,7 +245,7 @@ def lens_knocked_before(setting: Setting) -> Wrong:
 
 
 def lens_knocked_between(setting: Setting) -> Wrong:
-    """The principal point moves between two maps, or within the first of them."""
+    """The principal point moves between two maps, or within one of them."""
     what, true = _knocked(setting)
     share = 0.0 if setting.rng.random() < 0.5 else None
     return _spliced(setting, what, setting.scan("b", true), share=share)
@@ -373,7 +373,7 @@ CASES: Mapping[str, Case] = {
     "laser halved in mid-sweep": Case(gain_halved),
     "fog comes in mid-sweep": Case(fog_comes),
     "lens knocked before the run": Case(lens_knocked_before),
-    "lens knocked in mid-run": Case(lens_knocked_between, maps=2),
+    "lens knocked in mid-run": Case(lens_knocked_between, maps=3),
     "picture upside down": Case(upside_down),
     "picture mirrored": Case(mirrored),
     "another K than planned": Case(other_exposures),
