@@ -341,11 +341,15 @@ def _off_the_line(sweep: SweepCounts) -> tuple[Array, Array]:
     return ones, frames
 
 
+def _reach(sweep: SweepCounts) -> int:
+    """Pixels of a row, with those of windows that go beyond the sensor."""
+    return max(sweep.width, int(sweep.x0.max(initial=0)) + sweep.counts.shape[2])
+
+
 def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
     """1s and frames (rows, width) of all columns."""
     columns, rows, window = sweep.counts.shape
-    size = (rows, int(sweep.x0.max(initial=0)) + window)
-    ones, frames = np.zeros(size), np.zeros(size)
+    ones, frames = np.zeros((rows, _reach(sweep))), np.zeros((rows, _reach(sweep)))
     changes = np.flatnonzero(np.diff(sweep.x0)) + 1
     for first, last in zip((0, *changes), (*changes, columns), strict=True):  # columns that have the same window
         x = slice(int(sweep.x0[first]), int(sweep.x0[first]) + window)
@@ -357,7 +361,7 @@ def _everything(sweep: SweepCounts) -> tuple[Array, Array]:
 def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
     """For each pixel (rows, width or more), the column that, with those before and after it, gave most 1s."""
     columns, rows, window = sweep.counts.shape
-    size = (rows, int(sweep.x0.max(initial=0)) + window)
+    size = (rows, _reach(sweep))
     most, at = np.zeros(size, np.uint32), np.zeros(size, np.int32)
     for k in range(columns):
         x = slice(int(sweep.x0[k]), int(sweep.x0[k]) + window)
@@ -374,7 +378,7 @@ def _brightest_column(sweep: SweepCounts) -> NDArray[np.int32]:
 def _by_column(sweep: SweepCounts) -> tuple[Array, Array]:
     """Flux times frames, summed over the columns, and frames (rows, width)."""
     columns, rows, window = sweep.counts.shape
-    flux = np.zeros((rows, int(sweep.x0.max(initial=0)) + window))
+    flux = np.zeros((rows, _reach(sweep)))
     for k in range(columns):
         n = int(sweep.n_frames[k])
         # Nearly unbiased, and finite if all frames hold a 1 (docs/explanation/physics.md, Counts and flux).

@@ -1,19 +1,24 @@
 """Sequences of random events, each known by its seed: run them, count how they end, name those that end wrong."""
 
 import argparse
+import functools
+import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from drivers.errors import DeviceError
 from drivers.interfaces.device import Device
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 
 SEEDS_APART = 1_000_000
 CHUNK = 20
-"""Sequences that a process takes at a time."""
+"""Sequences of a case: they take milliseconds to seconds."""
 DONE = "done"
 
 
@@ -37,6 +42,13 @@ class Outcomes:
     struck: Counter[str] = field(default_factory=Counter)
     wrong: list[tuple[int, str]] = field(default_factory=list)
     worst: float = 0.0
+
+    def add(self, more: "Outcomes") -> None:
+        """Take those of other sequences too."""
+        self.ends.update(more.ends)
+        self.struck.update(more.struck)
+        self.wrong += more.wrong
+        self.worst = max(self.worst, more.worst)
 
 
 def ending(act: Callable[[], str], now_s: Callable[[], float], deadline_s: float) -> Ending:
@@ -100,18 +112,50 @@ class Verbs:
         return Ending(self._ends, wrong, self._longest_s)
 
 
-def campaign(sequence: Callable[[int], Ending], seeds: range, pool: Executor) -> Outcomes:
-    """The sequences of these seeds."""
+def campaign(sequence: Callable[[int], Ending], seeds: range) -> Outcomes:
+    """The sequences of these seeds, one after the other."""
     outcomes = Outcomes()
-    with pool:
-        for seed, one in zip(seeds, pool.map(sequence, seeds, chunksize=CHUNK), strict=True):
-            outcomes.ends.update(one.ends)
-            outcomes.struck.update(one.struck)
-            outcomes.worst = max(outcomes.worst, one.worst)
-            if one.wrong is not None:
-                outcomes.wrong.append((seed, one.wrong))
-                print(f"sequence {seed}: {one.wrong}", flush=True)
+    for seed in seeds:
+        one = sequence(seed)
+        wrong = [] if one.wrong is None else [(seed, one.wrong)]
+        outcomes.add(Outcomes(Counter(one.ends), Counter(one.struck), wrong, one.worst))
     return outcomes
+
+
+def chunk(make: str, inputs: Mapping[str, Any], first: int, end: int) -> dict[str, Any]:
+    """The sequences of seeds `first` to before `end`, as a case. make: 'module:function', which makes the sequence."""
+    logging.disable(logging.CRITICAL)  # each fault is worth a warning, and there are thousands
+    found = campaign(_made(make, json.dumps(inputs)), range(first, end))
+    return {"ends": found.ends, "struck": found.struck, "wrong": found.wrong, "worst": found.worst}
+
+
+@functools.cache
+def _made(make: str, inputs: str) -> Callable[[int], Ending]:
+    module, _, name = make.partition(":")
+    made: Callable[[int], Ending] = getattr(import_module(module), name)(**json.loads(inputs))
+    return made
+
+
+def in_chunks(
+    make: str, inputs: Mapping[str, Any], seeds: range, workers: int, out: Path | None = None
+) -> tuple[Outcomes, int]:
+    """The sequences of these seeds, done by several processes, and how many were not done, because they failed."""
+    cases = [
+        Case(
+            f"{__name__}:chunk",
+            {"make": make, "inputs": dict(inputs), "first": first, "end": min(first + CHUNK, seeds.stop)},
+            {"first": first},
+        )
+        for first in range(seeds.start, seeds.stop, CHUNK)
+    ]
+    outcomes, left = Outcomes(), 0
+    for case, found in zip(cases, results_of(cases, workers, out), strict=True):
+        if found is None:
+            left += case.inputs["end"] - case.inputs["first"]
+            continue
+        ends, struck = Counter[str](found["ends"]), Counter[str](found["struck"])
+        outcomes.add(Outcomes(ends, struck, [(seed, why) for seed, why in found["wrong"]], found["worst"]))
+    return outcomes, left
 
 
 def options(description: str | None, workers: int = 1) -> argparse.ArgumentParser:
@@ -119,22 +163,24 @@ def options(description: str | None, workers: int = 1) -> argparse.ArgumentParse
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequences", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=workers)
+    add_options(parser, workers)
     return parser
 
 
 def run(
-    sequence: Callable[[int], Ending],
-    asked: argparse.Namespace,
-    pool: Callable[[int], Executor] = ThreadPoolExecutor,
-    watched: str = "longest sequence, s",
+    make: str, asked: argparse.Namespace, inputs: Mapping[str, Any] | None = None, watched: str = "longest sequence, s"
 ) -> int:
-    """Run a campaign as asked and say how it ended; 1 where a sequence ended wrong. watched: what `worst` is."""
-    logging.disable(logging.CRITICAL)  # each fault is worth a warning, and there are thousands
+    """Run a campaign as asked and say how it ended; 1 where a sequence ended wrong, or was not done.
+
+    make: 'module:function', called with the inputs in each process, makes the sequence. watched: what `worst` is.
+    """
     seeds = range(asked.seed * SEEDS_APART, asked.seed * SEEDS_APART + asked.sequences)
-    outcomes = campaign(sequence, seeds, pool(asked.workers))
+    outcomes, left = in_chunks(make, inputs or {}, seeds, asked.workers, asked.out)
+    for seed, why in outcomes.wrong:
+        print(f"sequence {seed}: {why}")
     for what, counts in (("ends", outcomes.ends), ("faults", outcomes.struck)):
         print(f"{what}: " + (", ".join(f"{name} {n}" for name, n in counts.most_common()) or "none"))
     print(f"{watched}: {outcomes.worst:.3g}")
-    print(f"{len(outcomes.wrong)} of {asked.sequences} ended wrong")
-    return 1 if outcomes.wrong else 0
+    undone = f", {left} were not done" if left else ""
+    print(f"{len(outcomes.wrong)} of {asked.sequences} ended wrong{undone}")
+    return 1 if outcomes.wrong or left else 0

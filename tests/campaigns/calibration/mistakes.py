@@ -1,6 +1,6 @@
 """Deliberate mistakes in calibrating random rigs: does the verdict name them?
 
-    python -m tests.campaigns.calibration.mistakes --trials 30 --processes 2
+    python -m tests.campaigns.calibration.mistakes --trials 30 --workers 2
 
 Per trial one random rig makes every mistake once, and none once. Frames come from the simulator's photons as in
 `tests.campaigns.calibration.rigs`. What is named first counts: of a model the verdict's first reason, of views without
@@ -13,7 +13,6 @@ import argparse
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -26,10 +25,12 @@ from calibration.diagnosis.verdicts import judge_fit, judge_refused
 from calibration.errors import Degenerate
 from calibration.rig_fit.fit import fit_rig
 from calibration.views import BoardPose, View
+from rig.batch.case import Case
 from sim_backend.scenes.board import BoardAtPose
 from tests.campaigns.calibration.asked import NAMED, Figure, exit_code
 from tests.campaigns.calibration.board_capture import HOT_PER_S, Stand, SweepAsked, set_up, take_sweeps
 from tests.campaigns.calibration.rigs import CALIBRATED, OTHER_SPEED, room_picture, view_of
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.boards.random_rigs import BOARD, random_pose, random_poses, random_rig
 
 POSES = 8
@@ -269,16 +270,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=30)
     parser.add_argument("--first", type=int, default=1, help="seed of the first rig")
-    parser.add_argument("--processes", type=int, default=2)
+    add_options(parser)
     parser.add_argument("--only", nargs="*", default=[], help="mistakes to make, by name")
     asked = parser.parse_args()
     table: dict[str, Counter[str]] = defaultdict(Counter)
     seeds = range(asked.first, asked.first + asked.trials)
-    with ProcessPoolExecutor(asked.processes) as pool:
-        for seed, said in zip(seeds, pool.map(trial, seeds, [asked.only] * asked.trials), strict=True):
-            print(f"{seed}: " + ", ".join(f"{name} -> {code}" for name, code in said.items()), flush=True)
-            for name, code in said.items():
-                table[name][code] += 1
+    cases = [
+        Case("tests.campaigns.calibration.mistakes:trial", {"seed": seed, "only": asked.only}, {"seed": seed})
+        for seed in seeds
+    ]
+    for seed, said in zip(seeds, results_of(cases, asked.workers, asked.out), strict=True):
+        if said is None:
+            return 1
+        del said["measured"]
+        print(f"{seed}: " + ", ".join(f"{name} -> {code}" for name, code in said.items()))
+        for name, code in said.items():
+            table[name][code] += 1
     for mistake, wanted in MISTAKES.items():
         if (codes := table.get(mistake.__name__)) is not None:
             right = codes[wanted] / codes.total()

@@ -1,6 +1,6 @@
 """Random rigs calibrated from boards shown to them: is the depth as good as the calibration says it is?
 
-    python -m tests.campaigns.calibration.rigs --rigs 500 --processes 2
+    python -m tests.campaigns.calibration.rigs --rigs 500 --workers 2
 
 Every rig is its own (`tests.reference.boards.random_rigs`), is shown 10 to 16 poses, and swept both ways at K = 10
 (every fourth pose at K = 3 too, which tells the lags apart). Frames come from the simulator's photons, are counted as
@@ -16,13 +16,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +33,9 @@ from calibration.errors import CalibrationError, Degenerate
 from calibration.model.light_sheet import depth_slope
 from calibration.model.rig_model import RigModel
 from calibration.passages.find import SweepCounts, board_pixels, even_pixels, evenly, find_passages, flux_picture
-from calibration.rig_fit.fit import RigFit, fit_rig
+from calibration.rig_fit.fit import fit_rig
 from calibration.views import Passages, View, robust_sd
+from rig.batch.case import Case
 from rig.calibrate.session import load_views, save_view
 from sim_backend.effects.dark_counts import dark_rates
 from sim_backend.light.optics import Sensor
@@ -52,6 +51,7 @@ from tests.campaigns.calibration.board_capture import (
     speed,
     take_sweeps,
 )
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.boards.random_rigs import BOARD, random_poses, random_rig
 
 FAR_M = 5.0
@@ -76,14 +76,26 @@ class Compared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """Calibration of a rig. trouble: why there is no model, '' where there is one."""
+    """Calibration of a rig. trouble: why there is no model, '' where there is one. outliers: views that the fit left
+    out.
+    """
 
     seed: int
     seconds: float
     trouble: str
     poses: int = 0
     compared: Compared | None = None
-    fit: RigFit | None = None
+    outliers: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, result: Mapping[str, Any]) -> Outcome:
+        """The outcome in the result of `calibrated`."""
+        compared = None
+        if result["error_m"] is not None:
+            added = {(k, direction): px for k, direction, px in result["added_px"]}
+            compared = Compared(np.array(result["error_m"]), np.array(result["sd_m"]), added)
+        told = (result[name] for name in ("trouble", "poses"))
+        return cls(result["seed"], result["measured"]["seconds"], *told, compared, result["outliers"])
 
     def __str__(self) -> str:
         """One line."""
@@ -146,7 +158,7 @@ def summary(outcomes: Iterable[Outcome]) -> str:
             f"added to a scan at K = {exposures}, px: median {np.median(added):.4f}, 95 % "
             f"{np.percentile(added, 95):.4f}, worst {added.max():.4f}, above 0.1 px {np.mean(added > 0.1):.1%}"
         )
-    odd = Counter(name for o, _ in good if o.fit is not None for name in o.fit.outliers)
+    odd = Counter(name for o, _ in good for name in o.outliers)
     said.append(f"views called outliers: {sum(odd.values())} of {sum(o.poses for o, _ in good)}")
     return "\n".join(said)
 
@@ -226,13 +238,13 @@ def found_anew(view: View, sensor: Sensor) -> View:
     return replace(view, corners=corners)
 
 
-def calibrated(seed: int, kept: Path | None = None) -> Outcome:
-    """Make a rig, calibrate it, compare. kept: a folder of views, one folder a rig."""
-    begun = time.perf_counter()
+def calibrated(seed: int, kept: str | None = None) -> dict[str, Any]:
+    """Make a rig, calibrate it, compare: an `Outcome` as plain values. kept: a folder of views, one folder a rig."""
+    result: dict[str, Any] = {"seed": seed, "trouble": "", "poses": 0, "error_m": None, "outliers": []}
     rng = np.random.default_rng(seed)
     rig = random_rig(rng)
     camera = rig.model.camera
-    folder = None if kept is None else kept / f"{seed:05d}"
+    folder = None if kept is None else Path(kept) / f"{seed:05d}"
     if folder is not None and folder.is_dir():
         views = [found_anew(view, Sensor(pixel_seed=rig.pixel_seed)) for view in load_views(folder)]
     else:
@@ -243,8 +255,10 @@ def calibrated(seed: int, kept: Path | None = None) -> Outcome:
         fit = fit_rig(views, BOARD, (camera.width, camera.height))
         compared = compare(fit.model, rig.model)
     except CalibrationError as error:
-        return Outcome(seed, time.perf_counter() - begun, f"{getattr(error, 'reason', 'error')}: {error}")
-    return Outcome(seed, time.perf_counter() - begun, "", len(views), compared, fit)
+        return {**result, "trouble": f"{getattr(error, 'reason', 'error')}: {error}"}
+    added = [[k, direction, px] for (k, direction), px in compared.added_px.items()]
+    found = {"error_m": compared.error_m, "sd_m": compared.sd_m, "added_px": added}
+    return {**result, **found, "poses": len(views), "outliers": list(fit.outliers)}
 
 
 def _keep(views: Sequence[View], folder: Path) -> None:
@@ -266,16 +280,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rigs", type=int, default=500)
     parser.add_argument("--first", type=int, default=1, help="seed of the first rig")
-    parser.add_argument("--processes", type=int, default=2)
+    add_options(parser)
     parser.add_argument("--views", type=Path, metavar="FOLDER", help="where views are kept, to be fitted anew")
     asked = parser.parse_args()
-    outcomes = []
-    with ProcessPoolExecutor(asked.processes) as pool:
-        for outcome in pool.map(partial(calibrated, kept=asked.views), range(asked.first, asked.first + asked.rigs)):
-            outcomes.append(outcome)
-            print(outcome, flush=True)
+    kept = None if asked.views is None else str(asked.views.absolute())
+    seeds = range(asked.first, asked.first + asked.rigs)
+    cases = [Case("tests.campaigns.calibration.rigs:calibrated", {"seed": n, "kept": kept}, {"seed": n}) for n in seeds]
+    found = results_of(cases, asked.workers, asked.out)
+    outcomes = [Outcome.of(result) for result in found if result is not None]
+    for outcome in outcomes:
+        print(outcome)
     print(summary(outcomes))
-    return exit_code(figures([o.compared for o in outcomes if o.compared is not None]))
+    short = exit_code(figures([o.compared for o in outcomes if o.compared is not None]))
+    return short or int(len(outcomes) < len(found))
 
 
 if __name__ == "__main__":

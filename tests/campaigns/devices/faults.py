@@ -8,7 +8,6 @@ SPAD without markers.
 
 import sys
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 from tests.campaigns.devices import blanking, lasers, ni_cards, scanners, spad512s, spb_usb, syncs
@@ -41,13 +40,18 @@ WATCHED = {
 """Their worst figure; of the others it is the time of the longest sequence."""
 
 
+def sequence_of(driver: str) -> Callable[[int], Ending]:
+    """The sequence of a driver, by its name."""
+    return SEQUENCES[driver]
+
+
 def main() -> int:
     """1 where a sequence ended wrong."""
     parser = options(__doc__, workers=8)  # most sequences wait most of the time
     parser.add_argument("driver", choices=SEQUENCES)
     asked = parser.parse_args()
     watched = WATCHED.get(asked.driver, "longest sequence, s")
-    return run(SEQUENCES[asked.driver], asked, ProcessPoolExecutor, watched)
+    return run(f"{__package__}.faults:sequence_of", asked, {"driver": asked.driver}, watched)
 
 
 if __name__ == "__main__":

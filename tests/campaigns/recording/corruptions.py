@@ -14,8 +14,6 @@ It ends wrong where
 - after `repair` of false numbers `verify` says anything but whole, or whole with gaps, or a second repair does more.
 """
 
-import atexit
-import shutil
 import struct
 import tempfile
 import time
@@ -246,7 +244,7 @@ def salvage(folder: Path) -> str:
 
 
 def make_sequence(root: Path) -> Callable[[int], Ending]:
-    """A sequence for `tests.campaigns.outcomes.run`, working below `root`."""
+    """A sequence of `tests.campaigns.outcomes`, working below `root`."""
     made = [Pristine(root / f"pristine-{i}", lost=bool(i & 1), packed=bool(i & 2)) for i in range(len(ODDS))]
 
     def sequence(seed: int) -> Ending:
@@ -280,14 +278,10 @@ def ending_with(files: dict[str, bytes], root: Path, act: Callable[[Path], str],
         return ending(lambda: act(folder), time.monotonic, deadline_s)
 
 
-def scratch_folder() -> Path:
-    """A folder in memory where there is one; gone at the end."""
-    memory = Path("/dev/shm")
-    root = Path(tempfile.mkdtemp(prefix="corruptions-", dir=memory if memory.is_dir() else None))
-    atexit.register(shutil.rmtree, root, ignore_errors=True)
-    return root
+def sequence_here() -> Callable[[int], Ending]:
+    """The sequence of one process."""
+    return make_sequence(Path(tempfile.mkdtemp()))
 
 
 if __name__ == "__main__":
-    asked = options(__doc__).parse_args()
-    raise SystemExit(run(make_sequence(scratch_folder()), asked))
+    raise SystemExit(run("tests.campaigns.recording.corruptions:sequence_here", options(__doc__).parse_args()))

@@ -6,6 +6,7 @@ The wounds are those of `corruptions`, with plan and calibration among the files
 one, or missing, under the verdict 'complete'; anything raised but an error of ours; more than `DEADLINE_S`.
 """
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from rig.errors import RigError
 from rig.recording.inputs import PLAN_FILE
 from rig.run_folder.manifest import RunVerdict
 from tests.campaigns.outcomes import Ending, options, run
-from tests.campaigns.recording.corruptions import ending_with, scratch_folder, wound
+from tests.campaigns.recording.corruptions import ending_with, wound
 from tests.system.small_rig import config, write_rig
 
 DEADLINE_S = 60.0
@@ -28,7 +29,7 @@ INPUTS_STRUCK = 10
 
 
 def make_sequence(root: Path) -> Callable[[int], Ending]:
-    """A sequence for `tests.campaigns.outcomes.run`, working below `root`; one at a time."""
+    """A sequence of `tests.campaigns.outcomes`, working below `root`; one at a time."""
     content = config()
     content["scan"] |= {"columns": 100, "command_range": [-0.7, 0.7]}
     api.scan(write_rig(root / "rig", content), maps=MAPS, out=root / "run", record=True)
@@ -67,6 +68,10 @@ def _depth(folder: Path) -> list[NDArray[np.float32]]:
     return [np.load(file) for file in sorted((folder / "depth").glob("*.npy"))]
 
 
+def sequence_here() -> Callable[[int], Ending]:
+    """The sequence of one process."""
+    return make_sequence(Path(tempfile.mkdtemp()))
+
+
 if __name__ == "__main__":
-    asked = options(__doc__).parse_args()
-    raise SystemExit(run(make_sequence(scratch_folder()), asked))
+    raise SystemExit(run("tests.campaigns.recording.depth:sequence_here", options(__doc__).parse_args()))

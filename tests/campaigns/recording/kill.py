@@ -6,6 +6,8 @@ python -m tests.campaigns.recording.kill --sequences 500 --seed 1
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,16 +27,20 @@ def kill(striker: Striker, seed: int) -> Ending:
     return Ending([end], wrong, outcome.found - outcome.counted)
 
 
+def sequence_in(folder: str | None) -> Callable[[int], Ending]:
+    """The sequence of one process. folder: below which recordings are made; None for a temporary one."""
+    return partial(kill, Striker(Path(tempfile.mkdtemp(prefix="spadrig-kill-", dir=folder))))
+
+
 def main() -> int:
     """Run the campaign; 1 where anything was lost or invented."""
     parser = options(__doc__)
     parser.set_defaults(sequences=500)
-    parser.add_argument("--folder", type=Path, help="on the disk to be tried; a temporary one by default")
+    parser.add_argument("--folder", type=Path, help="on the disk to be tried; a temporary one in memory by default")
     asked = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="spadrig-kill-", dir=asked.folder) as folder:
-        striker = Striker(Path(folder))
-        print(f"a recording of {BLOCKS * STARTS} blocks takes {1e3 * striker.takes_s:.0f} ms", flush=True)
-        return run(lambda seed: kill(striker, seed), asked, watched="most blocks whole beyond those that counted")
+    where = None if asked.folder is None else str(asked.folder.absolute())
+    watched = "most blocks whole beyond those that counted"
+    return run("tests.campaigns.recording.kill:sequence_in", asked, {"folder": where}, watched)
 
 
 if __name__ == "__main__":

@@ -263,6 +263,14 @@ def test_pixels_that_no_window_held_are_nan():
     assert np.allclose(picture[:, 20:30], np.log(2), rtol=0.02)
 
 
+def test_a_picture_has_the_sensors_width_also_where_no_window_reaches_its_end():
+    counts = np.full((COLUMNS, HIGH, 32), 5, np.uint8)
+    frames, x0 = np.full(COLUMNS, 10), np.zeros(COLUMNS, np.int32)
+    picture = flux_picture((SweepCounts(counts, frames, np.arange(float(COLUMNS)), x0, WIDTH),))
+    assert picture.shape == (HIGH, WIDTH)
+    assert np.isnan(picture[:, 32:]).all()
+
+
 def test_edges_that_the_line_crosses_are_kept_clear_of_and_noise_is_none():
     rng = np.random.default_rng(4)
     picture = _print(0.4, 0.05)

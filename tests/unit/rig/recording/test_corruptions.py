@@ -1,7 +1,6 @@
 """A few sequences of the campaign against recordings, and that it sees what it looks for."""
 
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -19,10 +18,10 @@ def _quiet(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_damage_is_found_or_harmless(tmp_path: Path) -> None:
-    assert campaign(make_sequence(tmp_path), SEEDS, ThreadPoolExecutor(1)).wrong == []
+    assert campaign(make_sequence(tmp_path), SEEDS).wrong == []
 
 
 def test_the_campaign_sees_frames_that_were_not_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     unchecked = contents._block_at
     monkeypatch.setattr(reader, "read_entry", lambda segment, entry: unchecked(segment, entry, check_payload=False))
-    assert campaign(make_sequence(tmp_path), SEEDS, ThreadPoolExecutor(1)).wrong
+    assert campaign(make_sequence(tmp_path), SEEDS).wrong
