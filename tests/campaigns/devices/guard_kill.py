@@ -11,12 +11,15 @@ applications that lived ended with code 3 and a line that says why.
 
 import argparse
 import functools
+import math
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.wire.scans.scan_rig import Applications, ScanFailedError
 from tests.wire.scans.scan_strikes import (
     BY_HAND,
@@ -37,12 +40,23 @@ def applications() -> Applications:
     return Applications()
 
 
-def blow(name: str, laser: str, share: float) -> ScanOutcome | str:
-    """One, in a process of the pool; what was said where the scan did not come to light."""
+def blow(name: str, laser: str, share: float) -> dict[str, Any]:
+    """One blow as a case: its outcome, or what was said where the scan did not come to light."""
     try:
-        return strike_scan(applications(), name, laser, share)
+        outcome = asdict(strike_scan(applications(), name, laser, share))
     except ScanFailedError as error:
-        return str(error)
+        return {"failed": str(error)}
+    endless = [key for key, value in outcome.items() if value == math.inf]  # which JSON does not have
+    return {**outcome, "endless": endless}
+
+
+def outcome_of(result: dict[str, Any] | None) -> ScanOutcome | str:
+    """The outcome in the result of `blow`; what went wrong if there is none."""
+    if result is None or "failed" in result:
+        return "the case failed" if result is None else str(result["failed"])
+    endless = result.pop("endless")
+    del result["measured"]
+    return ScanOutcome(**{**result, **dict.fromkeys(endless, math.inf)})
 
 
 def main() -> int:
@@ -53,16 +67,21 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", choices=[*SCAN_STRIKES], default=[*SCAN_STRIKES])
     parser.add_argument("--lasers", nargs="*", choices=[*OPENING_S], default=["obis", "cobolt"])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
+    add_options(parser)
     options = parser.parse_args()
     random = np.random.default_rng(options.seed)
+    counts = {name: options.kills if name == KILL else options.others for name in options.only}
+    blows = [
+        {"name": name, "laser": options.lasers[i % len(options.lasers)], "share": float(random.random())}
+        for name, count in counts.items()
+        for i in range(count)
+    ]
+    cases = [Case("tests.campaigns.devices.guard_kill:blow", each, each) for each in blows]
+    outcomes = [outcome_of(result) for result in results_of(cases, options.workers, options.out)]
     passed = True
-    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
-        for name in options.only:
-            count = options.kills if name == KILL else options.others
-            lasers = [options.lasers[i % len(options.lasers)] for i in range(count)]
-            outcomes = list(pool.map(blow, [name] * count, lasers, random.random(count).tolist()))
-            passed &= _report(name, lasers, outcomes)
+    for name in counts:
+        mine = [i for i, each in enumerate(blows) if each["name"] == name]
+        passed &= _report(name, [blows[i]["laser"] for i in mine], [outcomes[i] for i in mine])
     return 0 if passed else 1
 
 
