@@ -10,6 +10,8 @@ Point and partners each have a line of counts: those of the row in the column.
 - Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
+- Unusable pixels of the calibration, hot or dead, differ from those beside them. If pixels at the places of a turned
+  picture do so more, the frames are turned.
 - Answers of estimators that learn the light. An answer is one of some 150 places, so a confidence of 0.9 needs evidence
   of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on average,
   which is light half a standard deviation above the background. The light at the answers must exceed the light behind
@@ -79,6 +81,16 @@ LEAST_SHARE: Final = 0.4
 """Share of dim answers' signal that must be there. Right ones have 0.43 to 0.92 in dense fog at K = 3 exposures."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """First and last pixel of an answer's light and of the light behind it, counted from the answer towards far depths."""
+
+FEWEST_DEFECTS, MOST_DEFECTS = 8, 2048
+"""Numbers of unusable pixels that show how the picture is turned: least, and most that are looked at."""
+BESIDE: Final = (-3, -2, -1, 1, 2, 3)
+"""Pixels of the same row with which an unusable one is compared."""
+MOST_OUT: Final = 10.0
+"""Standard deviations to which a pixel's difference from those beside it counts, so that no few pixels decide."""
+TURNED_LIMIT, LEAST_OUT = 6.0, 2.0
+"""Least mean difference by which unusable pixels stand out more where a turned picture has them: in its standard
+deviations, and in those of a count. On right maps it is negative."""
 
 ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
 """Wrong orders of pixels that are tried: what seems reversed in each."""
@@ -177,6 +189,8 @@ class MapChecks:
                 "check that ones are photons"
             )
             return (saturated,), stripe
+        if (turned := _turned(intensity, seen, self._geometry.defects)) is not None:
+            return (turned,), stripe
         usual = np.asarray(intensity / np.maximum(seen, 1), np.float32)
         usual[self._geometry.defects] = np.nan
         wrong = self._of_counts(counts, usual, DIMMEST * fired, stripe)
@@ -399,3 +413,39 @@ def _orders() -> NDArray[np.int64]:
     bits = 8 * byte + 7 - bit
     swapped = [8 * (byte // n * n + n - 1 - byte % n) + bit for n in (2, 4, 8)]
     return np.stack([bits, *swapped])
+
+
+def _turned(intensity: NDArray[np.uint32], seen: Array, defects: NDArray[np.bool_]) -> str | None:
+    """The doubt that the picture is turned against the calibration, whose unusable pixels stand out elsewhere; None if
+    they are few. seen: (width,), frames in whose window the pixels of a row were."""
+    inside = np.zeros(defects.shape, np.bool_)
+    inside[:, -min(BESIDE) : defects.shape[1] - max(BESIDE)] = True
+    y, x = np.nonzero(defects & inside & (seen > 0))
+    pick = evenly_spread(len(y), MOST_DEFECTS)
+    y, x = y[pick, None], x[pick, None] + np.array((0, *BESIDE))
+    usable = ~defects[y, x[:, 1:]] & (seen[x[:, 1:]] > 0)
+    y, x, usable = (each[usable.any(axis=1)] for each in (y, x, usable))
+    if len(y) < FEWEST_DEFECTS:
+        return None
+    pictures = {
+        "": intensity,
+        "upside down": intensity[::-1],
+        "mirrored": intensity[:, ::-1],
+        "turned by 180 degrees": intensity[::-1, ::-1],
+    }
+    if intensity.shape[1] % 8 == 0:
+        bits = intensity.reshape(len(intensity), -1, 8)[:, :, ::-1]
+        pictures["packed with the bits of each byte reversed"] = bits.reshape(intensity.shape)
+    out = {}
+    for name, picture in pictures.items():
+        around = (picture[y, x[:, 1:]] * usable).sum(axis=1) / usable.sum(axis=1)
+        out[name] = np.minimum(np.abs(picture[y[:, 0], x[:, 0]] - around) / np.sqrt(around + 1.0), MOST_OUT)
+    more = {name: each - out[""] for name, each in out.items() if name}
+    likeliest = max(more, key=lambda name: float(more[name].mean()))
+    mean, deviation = float(more[likeliest].mean()), float(more[likeliest].std(ddof=1)) / np.sqrt(len(y))
+    if mean < max(LEAST_OUT, TURNED_LIMIT * deviation):
+        return None
+    return (
+        f"the picture seems {likeliest}: pixels that the calibration calls unusable (hot or dead) stand out there, not "
+        "where it has them; check how frames are turned and packed, and that the calibration is of this sensor"
+    )

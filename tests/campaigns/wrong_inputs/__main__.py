@@ -49,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 ", ".join(f"{reason} {n}" for reason, n in by.most_common()) or "-",
             )
         )
-        doubted += name == "none" and sum(trial["caught"] for trial in trials)
+        doubted += sum(bool(trial["caught"] if name == "none" else trial["undisturbed_doubted"]) for trial in trials)
+    print(f"undisturbed maps that were doubted: {doubted}")
     return 1 if doubted else 0
 
 

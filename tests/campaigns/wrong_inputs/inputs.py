@@ -350,16 +350,18 @@ def gate_closed(setting: Setting) -> Wrong:
 
 @dataclass(frozen=True)
 class Case:
-    """A wrong input's maker, and what it needs of a setting. maps: to scan. fewest: exposures per column."""
+    """A wrong input's maker, and what it needs of a setting. maps: to scan. fewest: exposures per column. pixels:
+    whether a map of the sensor's pixels may matter."""
 
     make: Make
     maps: int = 1
     fewest: int = 1
+    pixels: bool = False
 
 
 CASES: Mapping[str, Case] = {
-    "none": Case(none),
-    "bit order swapped": Case(bit_order),
+    "none": Case(none, pixels=True),
+    "bit order swapped": Case(bit_order, pixels=True),
     "exposures and columns swapped": Case(exposures_for_columns, fewest=2),
     "columns reversed": Case(columns_reversed),
     "half a column late": Case(half_a_column_late, fewest=2),
@@ -374,8 +376,8 @@ CASES: Mapping[str, Case] = {
     "fog comes in mid-sweep": Case(fog_comes),
     "lens knocked before the run": Case(lens_knocked_before),
     "lens knocked in mid-run": Case(lens_knocked_between, maps=3),
-    "picture upside down": Case(upside_down),
-    "picture mirrored": Case(mirrored),
+    "picture upside down": Case(upside_down, pixels=True),
+    "picture mirrored": Case(mirrored, pixels=True),
     "another K than planned": Case(other_exposures),
     "blank column band": Case(blank_band),
     "scanner stuck": Case(scanner_stuck),

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from rig.api import reconstruct, scan
+from rig.api import calibrate_pixels, reconstruct, scan
 from rig.scan.run import RunResult
 from tests.campaigns.wrong_inputs.recorded import Recording
 from tests.reference.made_scenes import random_scene
@@ -62,6 +62,8 @@ def geometry(name: str) -> Content:
     }
 
 
+PIXEL_FRAMES = 3000
+"""Dark frames for a map of pixels."""
 RIGS = ("small", "left", "right", "turned")
 COLUMNS = {"small": 150}
 OTHER_COLUMNS = 200
@@ -69,7 +71,8 @@ OTHER_COLUMNS = 200
 
 @dataclass(frozen=True)
 class Setting:
-    """A rig before a scene. folder: for everything that is written. rng: for what a wrong input draws itself."""
+    """A rig before a scene. folder: for everything that is written. rng: for what a wrong input draws itself.
+    knows_pixels: whether the calibration has a map of unusable pixels, made by `rig calibrate pixels`."""
 
     folder: Path
     rng: np.random.Generator
@@ -79,20 +82,25 @@ class Setting:
     estimator: str
     seed: int
     maps: int = 1
+    knows_pixels: bool = False
     geometry: Content = field(default_factory=dict)
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, folder: Path, maps: int = 1, fewest: int = 1, rig: str = "") -> "Setting":
-        """A setting by chance. fewest: exposures per column."""
-        rig = rig or str(rng.choice(RIGS))
+    def drawn(
+        cls, rng: np.random.Generator, folder: Path, *, maps: int = 1, fewest: int = 1, pixels: bool = False
+    ) -> "Setting":
+        """A setting by chance. fewest: exposures per column. pixels: whether every other one has a map of pixels."""
+        rig = str(rng.choice(RIGS))
         exposures = int(rng.choice([k for k in EXPOSURES if k >= fewest]))
         scene, estimator = str(rng.choice(SCENES)), str(rng.choice(ESTIMATORS))
-        seed = int(rng.integers(1 << 31))
-        return cls(folder, rng, rig, scene, exposures, estimator, seed, maps, geometry(rig))
+        seed, knows_pixels = int(rng.integers(1 << 31)), pixels and bool(rng.random() < 0.5)
+        return cls(folder, rng, rig, scene, exposures, estimator, seed, maps, knows_pixels, geometry(rig))
 
     def told(self) -> dict[str, Any]:
         """The setting in plain values."""
-        return {name: getattr(self, name) for name in ("rig", "scene", "exposures", "estimator", "maps")}
+        return {
+            name: getattr(self, name) for name in ("rig", "scene", "exposures", "estimator", "maps", "knows_pixels")
+        }
 
     @property
     def rate_khz(self) -> int:
@@ -112,7 +120,13 @@ class Setting:
         content = {
             "name": "drawn",
             "calibration": "./calibration.yaml",
-            "world": {"kind": "simulated", "geometry": "./true.yaml", "scene": self._scene(here)},
+            "world": {
+                "kind": "simulated",
+                "geometry": "./true.yaml",
+                "scene": self._scene(here),
+                # Shares as in public data of such an array; unmapped ones would be the wrong input.
+                "sensor": {"hot_share": "1 %", "dead_share": "0.5 %"} if self.knows_pixels else {},
+            },
             "spad": {"kind": "simulated"},
             "scanner": {"kind": "simulated"},
             "laser": {"kind": "simulated", "max_power": "100 mW"},
@@ -128,6 +142,9 @@ class Setting:
             "estimate": {"estimator": "argmax"},
         }
         write_yaml(here / "rig.yaml", content)
+        if self.knows_pixels:
+            calibrate_pixels(here / "rig.yaml", seed=self.seed + 1, frames=PIXEL_FRAMES, out=here / "pixels")
+            write_yaml(here / "rig.yaml", content | {"calibration": "./pixels/calibration.yaml"})
         scan(here / "rig.yaml", record=True, maps=self.maps, seed=self.seed, out=here / "run")
         return here / "run"
 

@@ -18,7 +18,8 @@ def case(name: str, seed: int) -> dict[str, Any]:
     """The trial of this number of a case of `CASES`, in plain values.
 
     setting: what was drawn. what: what is wrong. off: largest relative depth error of a map at its median, None without
-    depth. undisturbed: the same without the wrong input, if `off` is more than OFF. wrong: whether `off` is more than
+    depth. undisturbed: the same without the wrong input, and undisturbed_doubted: whether that is not complete, if
+    `off` is more than OFF; else None. wrong: whether `off` is more than
     OFF, and more than WORSE times that. verdict: of the run, or 'error'. reasons: of the verdict, or the error's lines.
     caught: whether verdict or error say that something is wrong.
     """
@@ -26,20 +27,18 @@ def case(name: str, seed: int) -> dict[str, Any]:
     wanted = CASES[name]
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     with tempfile.TemporaryDirectory(prefix="wrong-") as folder:
-        setting = Setting.drawn(rng, Path(folder), wanted.maps, wanted.fewest)
-        wrong = wanted.make(setting)
+        setting = Setting.drawn(rng, Path(folder), maps=wanted.maps, fewest=wanted.fewest, pixels=wanted.pixels)
+        wrong, usual, doubted = wanted.make(setting), None, None
         try:
             summary = wrong.run().summary
             verdict, reasons = str(summary.verdict), [each.reason for each in summary.verdict_reasons]
             error = off(depths(setting.folder / "depth"), *wrong.true)
-            usual = None
             if error is not None and error > OFF:
                 run = wrong.undisturbed()
-                setting.depth(run, "undisturbed")
+                doubted = str(setting.depth(run, "undisturbed").summary.verdict) != "complete"
                 usual = off(depths(setting.folder / "undisturbed"), truths(run))
         except (RigError, DeviceError) as refused:
             verdict, reasons, error = "error", str(refused).splitlines(), None
-            usual = None
     return {
         "case": name,
         "seed": seed,
@@ -48,6 +47,7 @@ def case(name: str, seed: int) -> dict[str, Any]:
         "off": error,
         "wrong": error is not None and error > OFF and (usual is None or error > WORSE * usual),
         "undisturbed": usual,
+        "undisturbed_doubted": doubted,
         "verdict": verdict,
         "reasons": reasons,
         "caught": verdict != "complete" or bool(reasons),

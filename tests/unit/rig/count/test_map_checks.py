@@ -103,6 +103,31 @@ def test_a_wrong_map_says_what_is_wrong(change: Change, seen: str, lights: tuple
         assert reason.startswith(seen)
 
 
+@pytest.mark.parametrize(
+    ("turn", "seen"),
+    [
+        (lambda counts: counts[:, ::-1], "the picture seems upside down"),
+        (lambda counts: counts[:, :, ::-1], "the picture seems mirrored"),
+        (lambda counts: counts[:, ::-1, ::-1], "the picture seems turned by 180 degrees"),
+        (least_significant_first, "the picture seems packed with the bits of each byte reversed"),
+    ],
+)
+def test_unusable_pixels_show_how_the_picture_is_turned(turn: Callable[[Counts], Counts], seen: str) -> None:
+    sweep = simulated("report", 3, rows=ROWS, columns=COLUMNS)
+    defects = np.random.default_rng(2).random(sweep.counts.shape[1:]) < 0.002
+    geometry = replace(sweep.geometry, defects=defects)
+    hot = np.where(defects & (np.arange(ROWS)[:, None] % 4 > 0), 3, np.where(defects, 0, sweep.counts))
+    checks, stripe = MapChecks(geometry, calibrated=True, knows=False), StripeTable.empty(ROWS, COLUMNS)
+    right, turned = (volume_of(counts.astype(sweep.counts.dtype), geometry, 3) for counts in (hot, turn(hot)))
+    assert checks.check(right, right.intensity(), stripe)[0] == ()
+    (reason,) = checks.check(turned, turned.intensity(), stripe)[0]
+    assert reason.startswith(seen)
+    # Of a map of other pixels, none of which stands out anywhere, nothing follows.
+    other = replace(geometry, defects=np.random.default_rng(3).random(defects.shape) < 0.002)
+    plain = volume_of(sweep.counts, other, 3)
+    assert MapChecks(other, calibrated=True, knows=False).check(plain, plain.intensity(), stripe)[0] == ()
+
+
 def test_sure_answers_need_light() -> None:
     sweep = simulated("report", 10, rows=ROWS, columns=COLUMNS)
     volume, truth = sweep.volume, sweep.point.truth()
