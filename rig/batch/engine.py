@@ -238,7 +238,8 @@ class _Told:
             notes.append(f"{len(runs.failed)} failed")
         if not executor.workers:
             notes.append("waiting for workers")
-        tell_stage("cases", done, self._total, "done", ", ".join(notes))
+        # The stage changes with each tenth, since of each stage a line goes to where there is no terminal.
+        tell_stage(f"cases, {10 * (10 * done // max(1, self._total))} %", done, self._total, "done", ", ".join(notes))
         if self._progress is not None:
             self._progress(done, self._total)
 
