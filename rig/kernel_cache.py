@@ -1,7 +1,8 @@
 """Gives numba a folder for compiled kernels, and removes kernels that are out of date.
 
 Service accounts and containers often have no folder in which numba can store kernels. numba then refuses to compile at
-all, so `prepare_kernels` provides a folder.
+all, so `prepare_kernels` provides a folder. It also does where the program lies on a network disk, which computers with
+different processors share: each gets kernels of its own, on a disk of its own.
 
 numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
 file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest for each
@@ -21,6 +22,8 @@ VARIABLE = "NUMBA_CACHE_DIR"
 """numba's own environment variable (see its manual). A value that the user has set is kept."""
 PACKAGES = "calibration", "drivers", "rig", "sim_backend"
 TOP = Path(__file__).parent.parent
+NETWORK = {"nfs", "nfs4", "cifs", "smb3", "lustre", "beegfs", "gpfs", "ceph", "glusterfs", "afs", "fuse.sshfs"}
+"""File systems, as Linux names them, that several computers share."""
 NOTE = "spadrig-kernels-{}.json"
 """Name of the file with the digests. {} is for a digest of the checkout's path: checkouts may share one folder."""
 
@@ -28,8 +31,8 @@ NOTE = "spadrig-kernels-{}.json"
 def prepare_kernels() -> None:
     """Give numba a folder that it can write to, and remove stale kernels. Call this before numba is imported."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if VARIABLE not in os.environ and not _writable(TOP / "rig" / "__pycache__"):
-        os.environ[VARIABLE] = str(home / "spadrig-kernels" if _writable(home) else _private_folder())
+    if VARIABLE not in os.environ and not _serves(TOP / "rig" / "__pycache__"):
+        os.environ[VARIABLE] = str(home / "spadrig-kernels" if _serves(home) else _private_folder())
     kept = os.environ.get(VARIABLE)
     forget_stale(TOP, None if kept is None else Path(kept))
 
@@ -121,11 +124,23 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _writable(folder: Path) -> bool:
-    """Whether a folder can be written to. If it does not exist, the nearest existing folder above it decides."""
+def _serves(folder: Path) -> bool:
+    """Whether a folder can be written to, and is on a disk of this computer. If it does not exist, the nearest existing
+    folder above it decides."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
+    return folder.is_dir() and os.access(folder, os.W_OK) and file_system_of(folder) not in NETWORK
+
+
+def file_system_of(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
+    """Type of the file system that a folder is on, as Linux names it; empty where the system does not tell."""
+    try:
+        lines = [line.split() for line in mounts.read_text().splitlines()]
+    except OSError:
+        return ""
+    path = str(folder.resolve())
+    over = [(place, kind) for _, place, kind, *_ in lines if f"{path}/".startswith(f"{place.rstrip('/')}/")]
+    return max(over, key=lambda each: len(each[0]), default=("", ""))[1]
 
 
 def _private_folder() -> Path:

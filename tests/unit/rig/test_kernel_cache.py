@@ -16,7 +16,7 @@ posix = pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders of users a
 @pytest.fixture
 def _nothing_writable(monkeypatch, tmp_path):
     monkeypatch.delenv(kernel_cache.VARIABLE, raising=False)
-    monkeypatch.setattr(kernel_cache, "_writable", lambda folder: False)
+    monkeypatch.setattr(kernel_cache, "_serves", lambda folder: False)
     monkeypatch.setattr(kernel_cache.tempfile, "tempdir", str(tmp_path))
     yield
     os.environ.pop(kernel_cache.VARIABLE, None)
@@ -41,9 +41,27 @@ def test_a_private_folder_serves_where_nothing_can_be_written_and_one_of_others_
 
 
 @posix
+def test_a_program_on_a_network_disk_keeps_its_kernels_on_a_disk_of_this_computer(monkeypatch, tmp_path):
+    mounts = tmp_path / "mounts"
+    mounts.write_text(
+        f"disk / ext4 rw 0 0\nserver:/lab {tmp_path}/lab nfs4 rw 0 0\nserver:/la {tmp_path}/la ext4 rw 0 0\n"
+    )
+    (tmp_path / "lab" / "rig").mkdir(parents=True)
+    assert kernel_cache.file_system_of(tmp_path / "lab" / "rig", mounts) == "nfs4"
+    assert kernel_cache.file_system_of(tmp_path / "laboratory", mounts) == "ext4"
+    assert kernel_cache.file_system_of(tmp_path, tmp_path / "none") == ""
+    monkeypatch.setattr(kernel_cache, "file_system_of", lambda folder: "nfs4" if "lab" in folder.parts else "ext4")
+    monkeypatch.setattr(kernel_cache, "TOP", tmp_path / "lab")
+    monkeypatch.setenv(kernel_cache.VARIABLE, "")  # so that it is put back
+    monkeypatch.delenv(kernel_cache.VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    kernel_cache.prepare_kernels()
+    assert os.environ[kernel_cache.VARIABLE] == str(tmp_path / "home" / "spadrig-kernels")
+
+
 def test_the_users_own_setting_stays(monkeypatch, tmp_path):
     monkeypatch.setenv(kernel_cache.VARIABLE, str(tmp_path))
-    monkeypatch.setattr(kernel_cache, "_writable", lambda folder: False)
+    monkeypatch.setattr(kernel_cache, "_serves", lambda folder: False)
     kernel_cache.prepare_kernels()
     assert os.environ[kernel_cache.VARIABLE] == str(tmp_path)
 
