@@ -18,6 +18,7 @@ from itertools import count
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
 
 from calibration.errors import FileError
 from calibration.files.sections import load_yaml
@@ -35,6 +36,10 @@ AHEAD: Final = 2
 """Tasks that are sent ahead for each thread of a worker, so that none waits for the network."""
 PATIENCE_S: Final = 300.0
 """Seconds to wait for a scheduler that has gone away."""
+NO_WORKER_S: Final = 60.0
+"""Seconds to wait for other workers if all have been retired."""
+ANSWER_S: Final = 10.0
+"""Seconds in which a scheduler answers at first."""
 LOOK_S: Final = 1.0
 """Seconds from one count of the workers to the next."""
 MOST_NAMED: Final = 5
@@ -61,6 +66,8 @@ class Cluster:
         self._attempt = count()
         self._threads = 0
         self._looked_s = float("-inf")
+        self._with_workers_s = time.monotonic()
+        self._retired: set[str] = set()
         self.notes: list[str] = []
         """Sentences on workers that were retired."""
         try:
@@ -71,15 +78,19 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """Number of threads of all workers; 0 while there is no connection to the scheduler."""
+        """Number of threads of all workers that can do cases; 0 while there is no connection to the scheduler."""
         now_s = time.monotonic()
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s
             try:
                 connected = self._client.status == "running"
-                self._threads = sum(self._client.nthreads().values()) if connected else 0
+                threads = self._client.nthreads() if connected else {}
+                # A worker that holds something which no other can take stays there, retired or not.
+                self._threads = sum(number for each, number in threads.items() if each not in self._retired)
             except (OSError, TimeoutError):
                 self._threads = 0
+            if self._threads:
+                self._with_workers_s = now_s
         return self._threads
 
     @property
@@ -98,9 +109,12 @@ class Cluster:
         future.add_done_callback(lambda ended, name=task.name: self._ended.put((name, ended)))
 
     def wait(self) -> list[Ended]:
-        """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone."""
+        """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone, or all
+        workers."""
         if self._client.status == "closed":
             raise RigError("the scheduler is gone; start it, then run this again: it goes on where it stopped")
+        if self.notes and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
+            raise UsageError("no worker is left", *self.notes)
         ended: list[tuple[str, Future[Any]]] = []
         try:
             ended.append(self._ended.get(timeout=LOOK_S))
@@ -135,8 +149,15 @@ class Cluster:
         if note not in self.notes:
             self.notes.append(note)
             _log.warning("%s", note)
+<<<<<<< HEAD
+        address = ended.worker.partition(" ")[0]
+        self._retired.add(address)
+        with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
+            self._client.retire_workers([address], close_workers=True)
+=======
         with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
             self._client.retire_workers([ended.worker.partition(" ")[0]], close_workers=True)
+>>>>>>> bf1d620f0464b56026964336b2f5cba7aaa3fb82
         return Ended(ended.name, "lost", note)
 
 
@@ -148,6 +169,7 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
         raise UsageError(f"`cluster` needs the package distributed; {install_command('distributed')}") from error
     if "://" in cluster:
         try:
+            _require_answer(cluster)
             client = distributed.Client(cluster, timeout=PATIENCE_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise UsageError(f"no scheduler answers at {cluster} ({error}); start one with `dask scheduler`") from error
@@ -160,6 +182,15 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
         queue.close()
 
     return Cluster(store, client, limits, close=close)
+
+
+def _require_answer(address: str) -> None:
+    """Raise OSError unless something listens at an address: a client would try again and again for PATIENCE_S."""
+    parts = urlsplit(address)
+    if parts.scheme in ("tcp", "tls"):
+        if parts.port is None:
+            raise ValueError("the port is missing")
+        socket.create_connection((parts.hostname or "", parts.port), ANSWER_S).close()
 
 
 SYSTEMS: Final = {

@@ -1,0 +1,250 @@
+"""Cases on a dask cluster: in this process, and once on workers of their own, of which one is killed."""
+
+import gc
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig.batch import cluster as module
+from rig.batch.case import Case, checksum
+from rig.batch.cluster import Cluster, connect
+from rig.batch.engine import Batch, run_batch
+from rig.batch.pool import Limits
+from rig.batch.store import Store
+from rig.batch.task import Ended
+from rig.errors import RigError, UsageError
+from tests.unit.rig.batch import executors
+from tests.unit.rig.batch.executors import TINY, Inline, squares, troubles
+
+distributed = pytest.importorskip("distributed")
+ROOT = Path(__file__).parents[4]
+ALONE = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0"}
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two workers in this process."""
+    with distributed.LocalCluster(n_workers=2, **ALONE) as found:
+        yield found
+
+
+@pytest.fixture
+def client(cluster: Any) -> Iterator[Any]:
+    """A client of its own for each test."""
+    with distributed.Client(cluster, set_as_default=False) as found:
+        yield found
+
+
+def run(folder: Path, cases: list[Case], client: Any, limits: Limits | None = None, retries: int = 0) -> Batch:
+    """Do cases on the cluster."""
+    with Store(folder, cases) as store:
+        return run_batch(store, Cluster(store, client, limits), retries=retries)
+
+
+def test_a_cluster_gives_the_very_table_of_one_process(tmp_path: Path, client: Any) -> None:
+    done = run(tmp_path / "cluster", squares(12), client)
+    assert (done.verdict, done.done, done.workers) == ("complete", 12, 2)
+    with Store(tmp_path / "inline", squares(12)) as store:
+        run_batch(store, Inline())
+        workers = {row.measured["worker"].split()[0] for row in Store.rows(store)}
+        assert workers == {"inline"}
+    assert (tmp_path / "cluster" / "table.jsonl").read_bytes() == (tmp_path / "inline" / "table.jsonl").read_bytes()
+    assert client.status == "running", "the caller's own client stays open"
+    assert client.futures == {}
+
+
+def test_trouble_fails_its_own_case_alone_on_a_cluster_too(tmp_path: Path, client: Any) -> None:
+    cases = [*squares(3), *troubles("raise", tmp_path / "raise"), *troubles("die", tmp_path / "die", times=1)]
+    done = run(tmp_path / "out", cases, client, retries=1)
+    assert (done.verdict, done.done) == ("failures", 4)
+    assert [(each.kind, each.message) for each in done.failures] == [("raised", "ValueError: no 1 second line")]
+
+
+def test_limits_of_a_study_hold_after_those_of_another(tmp_path: Path, client: Any) -> None:
+    assert run(tmp_path / "one", squares(2), client, Limits(time_s=100.0)).verdict == "complete"
+    done = run(tmp_path / "two", troubles("hang", tmp_path / "counts"), client, Limits(time_s=0.5))
+    assert [each.message for each in done.failures] == ["the case took longer than 0.5 s"]
+
+
+def test_a_worker_with_other_code_or_without_a_file_is_named_before_anything_is_done(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "input").write_text("1")
+    cases = [Case(f"{TINY}:square", {"x": 1}, files=(str(tmp_path / "input"),))]
+    with Store(tmp_path / "out", cases) as store:
+        monkeypatch.setattr(module, "code_digest", lambda package: "another")
+        (tmp_path / "input").write_text("2")
+        with pytest.raises(UsageError) as refused:
+            Cluster(store, client)
+    lines = str(refused.value).splitlines()
+    assert len(lines) == 4
+    assert all(line.startswith("worker inproc://") for line in lines)
+    assert lines[0].endswith(f"does not see {tmp_path / 'input'}; share it under the same path, with the same content")
+    assert lines[1].endswith("has another version of the code or of its packages; install the same one")
+
+
+def test_a_folder_that_is_not_shared_or_only_for_reading_is_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "study.json").write_text("{}")
+    head = checksum(str(tmp_path / "study.json"))
+    assert module._problems(str(tmp_path), head, {}, {}) == []
+    assert module._problems(str(tmp_path), "another", {}, {}) == [
+        f"does not see {tmp_path}; share it under the same path, with the same content"
+    ]
+    assert len(module._problems(str(tmp_path / "none"), head, {}, {})) == 1
+    monkeypatch.setattr(os, "access", lambda *given: False)
+    assert module._problems(str(tmp_path), head, {}, {}) == [f"cannot write {tmp_path}; share it for writing"]
+
+
+def test_a_worker_that_cannot_do_cases_is_retired_and_its_cases_go_to_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(module, "_on_worker", executors.on_worker)
+    with distributed.LocalCluster(n_workers=2, **ALONE) as two, distributed.Client(two, set_as_default=False) as client:
+        old = min(client.nthreads())
+        monkeypatch.setattr(executors, "WITH_OLD_CODE", {old})
+        done = run(tmp_path / "out", squares(12), client)
+        assert (done.verdict, done.done) == ("complete", 12)
+        assert done.notes == (f"worker {old} host was retired: another version of the code is installed",)
+        assert old not in client.nthreads()
+        assert "was retired" in caplog.text
+
+        monkeypatch.setattr(module, "NO_WORKER_S", 1.0)
+        monkeypatch.setattr(executors, "WITH_OLD_CODE", {*client.nthreads()})
+        with pytest.raises(UsageError, match=r"no worker is left\nworker .* was retired: another version of the code"):
+            run(tmp_path / "again", squares(12), client)
+
+
+def test_an_interrupt_takes_back_what_was_sent(tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(self: Cluster) -> list[Ended]:
+        if found := wait(self):
+            raise KeyboardInterrupt
+        return found
+
+    wait = Cluster.wait
+    monkeypatch.setattr(Cluster, "wait", interrupt)
+    assert run(tmp_path / "out", squares(50), client).verdict == "aborted"
+    monkeypatch.undo()
+    assert run(tmp_path / "out", squares(50), client).verdict == "complete"
+
+
+def test_a_client_that_has_lost_its_scheduler_for_good_is_an_error(tmp_path: Path, cluster: Any) -> None:
+    own = distributed.Client(cluster, set_as_default=False)
+    with Store(tmp_path / "out", squares(2)) as store:
+        executor = Cluster(store, own)
+        own.close()
+        assert (executor.room, executor.workers) == (0, 0)
+        with pytest.raises(RigError, match="the scheduler is gone; start it, then run this again"):
+            run_batch(store, executor)
+
+
+@pytest.mark.parametrize(
+    ("address", "why"),
+    [("tcp://127.0.0.1:1", "Connection refused"), ("tcp://127.0.0.1", "the port is missing"), ("x://y:1", "unknown")],
+)
+def test_an_address_where_nobody_answers_is_said_at_once(tmp_path: Path, address: str, why: str) -> None:
+    with Store(tmp_path / "out", squares(2)) as store, pytest.raises(UsageError) as refused:
+        connect(address, store, Limits())
+    assert str(refused.value).startswith(f"no scheduler answers at {address} (")
+    assert why in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        (None, ["no.yaml` is no cluster (", "name local, tcp://HOST:PORT or a YAML file"]),
+        ("jobs: 2", ["system is None; it is one of slurm, pbs"]),
+        ("system: slurm", ["jobs is None; it is the number of jobs to ask for, 1 or more"]),
+        ("system: local\njobs: 2\nstrange: 1", ["its other keys are those of dask_jobqueue.LocalCluster"]),
+        ("system: local\njobs: 2", ["its other keys are those of dask_jobqueue.LocalCluster"]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")  # of an event loop that jobqueue leaves open if a key is missing
+def test_a_file_that_is_no_cluster_is_refused_in_lines(tmp_path: Path, text: str | None, problems: list[str]) -> None:
+    pytest.importorskip("dask_jobqueue")
+    file = tmp_path / "no.yaml"
+    if text is not None:
+        file.write_text(text)
+    said = ""
+    with Store(tmp_path / "out", squares(2)) as store:
+        try:
+            connect(str(file), store, Limits())
+        except UsageError as error:
+            said = str(error)
+    gc.collect()
+    for problem in problems:
+        assert problem in said
+
+
+@pytest.mark.parametrize(("package", "given"), [("distributed", "tcp://host:1"), ("dask_jobqueue", "slurm.yaml")])
+def test_a_package_that_is_missing_is_named_with_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, given: str
+) -> None:
+    def without(name: str) -> object:
+        if name.startswith(package):
+            raise ImportError(name)
+        return importlib.import_module(name)
+
+    monkeypatch.setattr(module, "import_module", without)
+    (tmp_path / "slurm.yaml").write_text("system: slurm\njobs: 2")
+    monkeypatch.chdir(tmp_path)
+    with Store(tmp_path / "out", squares(2)) as store, pytest.raises(UsageError, match=r"-m pip install") as refused:
+        connect(given, store, Limits())
+    assert package.replace("_", "-") in str(refused.value)
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
+    python = [sys.executable, "-m"]
+    place = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    file = tmp_path / "scheduler.json"
+    scheduler = [*python, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    worker = [*python, "distributed.cli.dask_worker", "--no-nanny", "--nthreads", "1", "--no-dashboard"]
+    started = [subprocess.Popen([*scheduler, "--scheduler-file", str(file)], **place)]  # type: ignore[call-overload]
+    try:
+        started += [
+            subprocess.Popen([*worker, "--scheduler-file", str(file)], **place)  # type: ignore[call-overload]
+            for _ in range(2)
+        ]
+        with distributed.Client(scheduler_file=str(file), set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+            cases = [Case(f"{TINY}:square", {"x": x, "sleep_s": 0.1}, {"x": x}) for x in range(20)]
+            killed: list[int] = []
+
+            def kill(done: int, total: int) -> None:
+                if done > 2 and not killed:
+                    killed.append(started[1].pid)
+                    os.kill(started[1].pid, signal.SIGKILL)
+
+            with Store(tmp_path / "out", cases) as store:
+                done = run_batch(store, Cluster(store, client), progress=kill, retries=0)
+            assert killed != []
+            assert (done.verdict, done.done, done.failures) == ("complete", 20, ())
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+
+
+def test_a_task_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:
+    with Store(tmp_path / "out", squares(1)) as store:
+        executor = Cluster(store, client)
+        task = store.task(store.names[0])
+        executor.submit(task)
+        executor.submit(task)
+        told: list[Ended] = []
+        until_s = time.monotonic() + 20
+        while not told and time.monotonic() < until_s:
+            told += executor.wait()
+        told += executor.wait()
+        executor.close()
+    assert [each.status for each in told] == ["done"]
