@@ -12,14 +12,17 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstruct
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
-from tests.reference.tables.printed import Table, parser_of, scenes_asked
+from tests.reference.tables.printed import Table, names_asked, parser_of, scene_named, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, score
 
 ESTIMATORS = ("argmax", "edge", "likelihood")
@@ -77,8 +80,29 @@ def named(estimator: str, filter: str) -> str:
     return estimator if filter == "none" else f"{estimator} + {filter}"
 
 
+def one_cell(
+    scene: str,
+    point: str,
+    rig: str,
+    exposures: int,
+    seeds: int,
+    estimators: Sequence[str],
+    filters: Sequence[str],
+    row_step: int,
+) -> dict[str, Any]:
+    """A scene at a point with a number of exposures as a case: [name, figures] of every estimator and filter."""
+    measurement = Measurement(estimators, filters, {"genie": Genie()}, row_step)
+    found = scene_named(scene)
+    assert found is not None, "it was there when the table was asked for"
+    height, width = found.shape
+    geometry = Geometry.build(width=width, height=height, **RIGS[rig])  # type: ignore[arg-type]
+    means = list(measurement.means(WorkingPoint(found, POINTS[point], geometry), exposures, seeds))
+    figures = [[name, of] for name, of, _ in means]
+    return {"figures": figures, "measured": {"estimate_s": [seconds for *_, seconds in means]}}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table, and write it where asked."""
+    """Print the table, and write it where asked. 1 where a case failed."""
     parser = parser_of("tests.reference.tables.accuracy", __doc__, points="report,dense,clear")
     parser.add_argument("--exposures", help="comma-separated; default depends on the point")
     parser.add_argument("--seeds", type=int, default=1, help="number of seeds averaged")
@@ -86,27 +110,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
     parser.add_argument("--filters", default=",".join(FILTERS))
     parser.add_argument("--row-step", type=int, default=1, help="score every n-th row only")
+    add_options(parser, workers=1)
     options = parser.parse_args(arguments)
-    filters = options.filters.split(",")
-    measurement = Measurement(options.estimators.split(","), filters, {"genie": Genie()}, options.row_step)
-    scenes = scenes_asked(parser, options.scenes)
+    scenes_asked(parser, options.scenes)  # or an error that names the one that is absent
+    fixed = {
+        "rig": options.rig, "seeds": options.seeds, "row_step": options.row_step,
+        "estimators": options.estimators.split(","), "filters": options.filters.split(","),
+    }  # fmt: skip
+    cells = [
+        {"point": point, "scene": scene, "exposures": int(exposures)}
+        for point in options.points.split(",")
+        for scene in names_asked(options.scenes)
+        for exposures in (options.exposures.split(",") if options.exposures else DEFAULT_EXPOSURES[point])
+    ]
+    cases = [Case("tests.reference.tables.accuracy:one_cell", {**each, **fixed}, each) for each in cells]
+    results = results_of(cases, options.workers, options.out)
     table = Table(TITLES)
-    for name in options.points.split(","):
-        chosen = options.exposures.split(",") if options.exposures else DEFAULT_EXPOSURES[name]
-        for scene in scenes:
-            height, width = scene.shape
-            geometry = Geometry.build(width=width, height=height, **RIGS[options.rig])  # type: ignore[arg-type]
-            point = WorkingPoint(scene, POINTS[name], geometry)
-            for exposures in map(int, chosen):
-                reference = np.nan
-                for estimator, f, seconds in measurement.means(point, exposures, options.seeds):
-                    if estimator == "genie":
-                        reference = f["mean_abs"]
-                    figures = [f"{f[key]:.3f}" for key in ("median_abs", "within_1px", "missing", "mean_abs_rounded")]
-                    found = f"{f['mean_abs']:.3f}", f"{f['mean_abs'] / reference:.2f}", *figures, f"{seconds:.2f}"
-                    table.add([name, scene.name, exposures, estimator, *found])
-                table.write(options.markdown)
-    return 0
+    for each, result in zip(cells, results, strict=True):
+        reference = np.nan
+        for (name, f), seconds in zip(*_of(result), strict=True):
+            if name == "genie":
+                reference = f["mean_abs"]
+            figures = [f"{f[key]:.3f}" for key in ("median_abs", "within_1px", "missing", "mean_abs_rounded")]
+            found = f"{f['mean_abs']:.3f}", f"{f['mean_abs'] / reference:.2f}", *figures, f"{seconds:.2f}"
+            table.add([*each.values(), name, *found])
+    table.write(options.markdown)
+    return int(None in results)
+
+
+def _of(result: dict[str, Any] | None) -> tuple[list[Any], list[float]]:
+    return ([], []) if result is None else (result["figures"], result["measured"]["estimate_s"])
 
 
 if __name__ == "__main__":

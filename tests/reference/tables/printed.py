@@ -51,15 +51,20 @@ def scenes_asked(parser: argparse.ArgumentParser, names: str | None, rows: int |
 
     rows: the middle ones of each, None for all.
     """
-    chosen = names.split(",") if names else scene_names() or ("procedural",)
-    scenes = [_scene(name) for name in chosen]
+    scenes = [scene_named(name) for name in names_asked(names)]
     found = [scene for scene in scenes if scene is not None]
     if len(found) < len(scenes):
         parser.error(f"a scene of {names} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
     return [scene if rows is None else scene.crop(min(rows, scene.shape[0]), scene.shape[1]) for scene in found]
 
 
-def _scene(name: str) -> Scene | None:
+def names_asked(names: str | None) -> Sequence[str]:
+    """Names of the scenes: those asked for or, by default, those of `scenes_asked`."""
+    return names.split(",") if names else scene_names() or ("procedural",)
+
+
+def scene_named(name: str) -> Scene | None:
+    """The scene of a name; None if there is none."""
     if name.startswith("random-"):
         return random_scene(int(name.removeprefix("random-")))
     return procedural_scene() if name == "procedural" else load_scene(name)
