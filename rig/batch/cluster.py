@@ -149,15 +149,10 @@ class Cluster:
         if note not in self.notes:
             self.notes.append(note)
             _log.warning("%s", note)
-<<<<<<< HEAD
         address = ended.worker.partition(" ")[0]
         self._retired.add(address)
         with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
             self._client.retire_workers([address], close_workers=True)
-=======
-        with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
-            self._client.retire_workers([ended.worker.partition(" ")[0]], close_workers=True)
->>>>>>> bf1d620f0464b56026964336b2f5cba7aaa3fb82
         return Ended(ended.name, "lost", note)
 
 

@@ -4,13 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-<<<<<<< HEAD
 from rig.batch import cluster
 from rig.batch.case import Case
 from rig.batch.pool import Limits
-=======
-from rig.batch.case import Case
->>>>>>> bf1d620f0464b56026964336b2f5cba7aaa3fb82
 from rig.batch.task import Ended, Task, perform
 
 TINY = "tests.unit.rig.batch.tiny"
@@ -62,7 +58,6 @@ class Inline:
         """Forget all tasks."""
         self.closed = True
         self._tasks.clear()
-<<<<<<< HEAD
 
 
 WITH_OLD_CODE: set[str] = set()
@@ -78,5 +73,3 @@ def on_worker(task: Task, limits: Limits) -> Ended:
     if address in WITH_OLD_CODE:
         return Ended(task.name, "other code", "another version of the code is installed", worker=f"{address} host")
     return _really(task, limits)
-=======
->>>>>>> bf1d620f0464b56026964336b2f5cba7aaa3fb82
