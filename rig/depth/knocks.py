@@ -34,7 +34,8 @@ LEAST_SAME: Final = 0.5
 
 KNOCKED: Final = (
     "all stripes have moved along their rows by the same distance, near and far alike, which no motion of the scene "
-    "does: camera, lens or mirror has moved since the map before; look what is loose, and check the calibration"
+    "does: camera, lens or mirror has moved since the map before (or, if it sweeps both ways, its lag is wrong); look "
+    "what is loose, and check the calibration"
 )
 
 
