@@ -343,7 +343,7 @@ def _off_the_line(sweep: SweepCounts) -> tuple[Array, Array]:
 
 def _reach(sweep: SweepCounts) -> int:
     """Pixels of a row, with those of windows that go beyond the sensor."""
-    return max(sweep.width, int(sweep.x0.max(initial=0)) + sweep.counts.shape[2])
+    return max(sweep.width, int(sweep.x0.max(initial=0)) + int(sweep.counts.shape[2]))
 
 
 def _everything(sweep: SweepCounts) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from calibration.files.sections import load_yaml
 from drivers.recorded.contents import INDEX_FILE
 from rig.errors import UsageError
 from rig.kernel_cache import TOP
@@ -121,6 +122,20 @@ def checksum(path: str) -> str:
         return hashlib.sha256("".join(lines).encode()).hexdigest()
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}; correct the path") from error
+
+
+def files_of(config: Mapping[str, Any], scene: str | None = None) -> tuple[str, ...]:
+    """Paths of the files and folders that decide what a config means: calibration, learned state, scene and surfaces.
+
+    config: its content, with absolute paths. scene: used in place of the config's.
+    """
+    world, estimate = config.get("world") or {}, config.get("estimate") or {}
+    scene = world.get("scene") if scene is None else scene
+    paths = [config.get("calibration"), estimate.get("learned"), world.get("geometry"), scene]
+    if isinstance(scene, str) and Path(scene).suffix in (".yaml", ".yml") and Path(scene).is_file():
+        surfaces = load_yaml(Path(scene), "a scene", "surfaces: street").content.get("surfaces")
+        paths.append(str(Path(scene).absolute().parent / surfaces) if isinstance(surfaces, str) else None)
+    return tuple(dict.fromkeys(path for path in paths if isinstance(path, str) and Path(path).exists()))
 
 
 def _checksum_of_file(file: Path) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rig.batch.case import Case
+from rig.batch.case import Case, files_of
 from rig.config.estimators import estimator_names
 from rig.config.files import load_config, portable_content
 from rig.config.models import AUTO, RigConfig
@@ -101,13 +101,6 @@ def require_simulated(config: RigConfig) -> None:
         raise UsageError(f"{config.name} is a real rig, and cases are done on any computer; name a simulated one")
     if config.world.real_time:
         raise UsageError(f"{config.name} runs in the host's time; name a rig that does not, such as {SIMULATED!r}")
-
-
-def files_of(content: Mapping[str, Any]) -> tuple[str, ...]:
-    """Paths of the files that a config refers to: its calibration, the scene, a learned state."""
-    world, estimate = content.get("world") or {}, content.get("estimate") or {}
-    paths = [content.get("calibration"), world.get("scene"), estimate.get("learned")]
-    return tuple(path for path in paths if isinstance(path, str) and Path(path).is_absolute() and Path(path).exists())
 
 
 def kept_cases(cases: Sequence[Case], omit: Sequence[Mapping[str, Any]]) -> list[bool]:

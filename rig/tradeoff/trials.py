@@ -6,7 +6,7 @@ from itertools import product, starmap
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from rig.batch.case import Case, Result
+from rig.batch.case import Case, Result, files_of
 from rig.config.estimators import estimator_names
 from rig.config.files import portable_content
 from rig.config.models import AUTO, RigConfig
@@ -100,7 +100,7 @@ def cases_of(trials: Trials, asked: TradeoffRequest) -> list[Case]:
         setting = {"scene": scene, "fog": trial.fog, "exposures": trial.exposures, "lines": len(config.line_offsets)}
         content = portable_content(config)
         inputs = {"config": content, "place": [scene, trial.fog], "methods": [asked.estimators, asked.filters]}
-        files = tuple(path for path in (content.get("calibration"), scene) if path and Path(path).exists())
+        files = files_of(content)
         for seed in range(asked.seed, asked.seed + asked.repeat):
             cases.append(Case(f"{__name__}:scan_once", {**inputs, "seed": seed}, {**setting, "seed": seed}, files))
     return cases

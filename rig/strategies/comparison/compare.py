@@ -19,7 +19,7 @@ import numpy as np
 
 from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
-from rig.batch.case import Case, Result
+from rig.batch.case import Case, Result, files_of
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.config.overrides import configure
@@ -185,7 +185,7 @@ def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan)
             asked, scenes=[str(Path(scene).absolute()) if there else scene], airs=[air], times_s=[time_s], rules=[rule]
         )
         plan = {**asdict(one), "seeds": [asked.seeds.start, asked.seeds.stop]}
-        files = tuple(path for path in (content.get("calibration"), one.scenes[0] if there else None) if path)
+        files = files_of(content, one.scenes[0])
         labels = {"scene": scene, "air": air, "rule": rule, "time_ms": 1e3 * time_s}
         cases.append(Case(f"{__name__}:measure_once", {"config": content, "ways": names, "plan": plan}, labels, files))
     return cases
