@@ -1,9 +1,10 @@
 """Reads JSON texts that may be damaged. A text that nests too deep, holds an integer of more than 20 digits, a number
-that is not finite or a key that no terminal can show, raises ValueError like any other damage.
+that is not finite, a key that no terminal can show or half a character, raises ValueError like any other damage.
 """
 
 import json
 import math
+import re
 from typing import Any, Final
 
 MAX_DEPTH: Final = 64
@@ -41,6 +42,8 @@ def _refused(word: str) -> None:
 
 
 def _require_flat(content: Any, left: int) -> None:
+    if isinstance(content, str) and not content.isascii() and _HALVES.search(content):
+        raise ValueError("a text has half a character, which no file can hold")
     if not isinstance(content, dict | list):
         return
     if left == 0:
@@ -52,4 +55,5 @@ def _require_flat(content: Any, left: int) -> None:
         _require_flat(part, left - 1)
 
 
+_HALVES: Final = re.compile(r"[\ud800-\udfff]")
 _TOO_DEEP: Final = f"nested more than {MAX_DEPTH} deep"

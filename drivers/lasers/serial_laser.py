@@ -29,7 +29,7 @@ from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.interfaces.device import OPEN_STATES
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming, OnSilence
-from drivers.transports.endpoints import EMULATED_PREFIX, resolve
+from drivers.transports.endpoints import EMULATED_PREFIX, printable, resolve
 from drivers.transports.serial_device import SerialDevice
 from drivers.transports.serial_port import BAUD, SerialPort
 from drivers.units import Seconds, Watts
@@ -99,8 +99,8 @@ class SerialLaser(SerialDevice, LineLaser):
     """`SerialLaserConfig.silence`, in seconds."""
 
     def __init__(self, name: str, line: Dialogue, limits: LaserLimits) -> None:
-        super().__init__(name)
-        line.name = name
+        super().__init__(printable(name))
+        line.name = self.name
         self._line = line
         self._limits = limits
         self._armed = False
@@ -249,7 +249,7 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
     """Raise `DeviceNotFound` if the config names another laser than the one found."""
     if config.serial_number not in (None, found):
         raise DeviceNotFound(
-            f"{make} laser on {config.port} has serial number {found}, not {config.serial_number}; correct "
+            f"{make} laser on {config.port} has serial number {printable(found)}, not {config.serial_number}; correct "
             "'serial_number' or 'port'"
         )
 

@@ -19,7 +19,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 
 from drivers.errors import CommandRefused, DeviceBusy, DeviceDisconnected, DeviceError, DeviceTimeout, ProtocolError
-from drivers.transports.endpoints import Endpoint
+from drivers.transports.endpoints import Endpoint, printable
 from drivers.transports.tap import IN, OUT, Tap
 from drivers.transports.tcp_line import TcpStream
 
@@ -172,7 +172,7 @@ class EtherDreamLine:
 
     def version(self) -> str:
         """The firmware's name for itself. The oldest firmware does not know the command and closes the connection."""
-        return self._exchange(VERSION, _VERSION_BYTES).split(b"\0")[0].decode("ascii", "replace")
+        return printable(self._exchange(VERSION, _VERSION_BYTES).split(b"\0")[0].decode("ascii", "replace"))
 
     def close(self) -> None:
         """Close the connection; a second call does nothing."""

@@ -54,7 +54,7 @@ from drivers.scanners.dac_scanner import (
     colour,
 )
 from drivers.scanners.galvo import LOWEST_RATE_HZ, GalvoConfig
-from drivers.transports.endpoints import Endpoint, resolve
+from drivers.transports.endpoints import Endpoint, printable, resolve
 from drivers.transports.tap import Tap
 from drivers.transports.usb_device import UsbDevice, UsbId
 from drivers.units import Hertz, Seconds
@@ -191,7 +191,7 @@ class HeliosDac:
         (version,) = struct.unpack("<I", self._ask(_VERSION, 0x84, 4)[:4])
         self.firmware: int = version
         self._send(_SDK_VERSION, _OUR_SDK_VERSION)
-        self.stored_name = self._ask(_NAME, 0x85, 1).split(b"\0")[0].decode("ascii", "replace")
+        self.stored_name = printable(self._ask(_NAME, 0x85, 1).split(b"\0")[0].decode("ascii", "replace"))
         self.serial = self.stored_name or None
         self.identity = f"{self.name}, {self.stored_name!r}, firmware {self.firmware}"
         self.stop()

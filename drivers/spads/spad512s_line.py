@@ -9,12 +9,14 @@ be sent before the text "The breakdown is around" has come; after it `D` is sent
 """
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from drivers.errors import GONE, DeviceBusy, DeviceDisconnected, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.endpoints import printable
 from drivers.transports.tap import IN, OUT, Tap
 from drivers.transports.tcp_line import TcpStream
 
@@ -132,9 +134,12 @@ class Spad512sLine:
         """The first n numbers of an answer; newer programs and emulations send more. Raises ProtocolError for fewer."""
         fields = self.ask(command).replace("\n", ",").split(",")
         try:
-            return [float(fields[i]) for i in range(n)]
+            numbers = [float(fields[i]) for i in range(n)]
+            if all(map(math.isfinite, numbers)):
+                return numbers
         except (IndexError, ValueError):
-            raise ProtocolError(f"{self._name} answers {command} with {fields!r}, not with {n} numbers") from None
+            pass
+        raise ProtocolError(f"{self._name} answers {command} with {fields!r}, not with {n} numbers")
 
     def receive_into(self, view: memoryview, wait_s: float) -> int:
         """Receive bytes of a run; returns their number, 0 if none came. May raise `DeviceDisconnected`."""
@@ -179,7 +184,7 @@ class Spad512sLine:
                 f"{self._name}: nothing greets at {self.address} within {self._deadlines.open_s:g} s; is it the "
                 "vendor's program?"
             )
-        detector = banner.split()[0]
+        detector = printable(banner.split()[0])
         if "SPAD" not in detector.upper():
             # A newer program may greet in other words; whether it is one shows in its answer to D.
             _log.warning("%s: %s greets with %r, which names no SPAD", self._name, self.address, banner[:60])
@@ -207,7 +212,7 @@ class Spad512sLine:
         stream.drain(QUIET_S, self._deadlines.answer_s)
 
     def _identity_of(self, detector: str, answer: str) -> Spad512sIdentity:
-        lines = [line.rpartition(":")[2].strip() for line in answer.splitlines() if line.strip()]
+        lines = [printable(line.rpartition(":")[2].strip()) for line in answer.splitlines() if line.strip()]
         lines = [line for line in lines if line != DONE.decode()]
         if len(lines) < 7:
             raise ProtocolError(f"{self._name} answers D with {len(lines)} lines, not with its serials and versions")

@@ -16,6 +16,7 @@ from drivers.errors import CorruptBlock, DeviceFault, DeviceTimeout, ProtocolErr
 from drivers.spb1.layout import REGISTER_ACK
 from drivers.spb1.reader import read_control, read_header
 from drivers.transports.bulk_link import BulkLink
+from drivers.transports.endpoints import printable
 from drivers.transports.tap import IN, OUT, Tap
 
 COMMAND: Final = struct.Struct("<4sHHII")
@@ -246,7 +247,7 @@ class ControlChannel:
         """The text in registers that hold it padded with zeros."""
         words = self.read_all([register + at for at in range(0, size, 4)])
         raw = b"".join(word.to_bytes(4, "little") for word in words)
-        return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
+        return printable(raw.split(b"\0")[0].decode("utf-8", "replace").strip())
 
     def write_all(self, values: Iterable[tuple[int, int]]) -> None:
         """Write several registers. Raises `DeviceFault` if the device refuses one."""

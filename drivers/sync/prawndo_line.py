@@ -238,7 +238,7 @@ class PrawnDoLine:
         lines = self.transact(f"{command}\n{command}", deadline_s, urgent=urgent)
         try:
             first, second = (parse(line) for line in lines)
-        except (ValueError, KeyError):
+        except (IndexError, KeyError, ValueError):
             raise ProtocolError(f"{self._name}: {command} was answered {lines}; check the cable") from None
         if first != second:
             raise ProtocolError(f"{self._name}: {command} was answered {lines}, which differ; check the cable")

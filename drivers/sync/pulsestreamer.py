@@ -58,7 +58,7 @@ from drivers.sync.pulsestreamer_sequence import (
     SweepCount,
     compile_sequence,
 )
-from drivers.transports.endpoints import resolve
+from drivers.transports.endpoints import one_line, resolve
 from drivers.units import Seconds
 
 _log = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ class PulseStreamer(SyncBoard):
         self._rpc.call("reset")  # ends what else a program may have left: a square wave, a trigger
         self._lower()
         self._firmware = self._check_firmware()
-        self._serial = str(self._rpc.call("getSerial"))
+        self._serial = one_line(self._rpc.call("getSerial"))
         self._forgotten = weakref.finalize(self, _forgotten, self.name, self._rpc, self._armed, os.getpid())
         self._rpc.call("selectClock", CLOCKS[config.clock])
         self._check_clock()
@@ -347,8 +347,8 @@ class PulseStreamer(SyncBoard):
 
     def _check_firmware(self) -> str:
         """The firmware's version; raises `ProtocolError` if it is too old."""
-        version = str(self._rpc.call("getFirmwareVersion"))
-        numbers = re.match(r"(\d+)\.(\d+)\.(\d+)", version)
+        version = one_line(self._rpc.call("getFirmwareVersion"))
+        numbers = re.match(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})(?!\d)", version, re.ASCII)
         if numbers is None:
             raise ProtocolError(f"{self.name}: no version in {version!r}; is this a Pulse Streamer 8/2?")
         if tuple(map(int, numbers.groups())) < OLDEST_FIRMWARE:

@@ -43,6 +43,8 @@ sequence in its midst, with the gate high."""
 _RETRY_PAUSE_S = 0.005
 _STEP_S = 0.01
 """Time from one look at what has arrived to the next."""
+_MOST_SHOWN = 200
+"""Most characters of the box's own words in a message."""
 _MOST_BYTES = 65_536
 """Longer than any answer."""
 EVERYBODY = (("255.255.255.255", 12_345), ("239.255.255.82", 12_345))
@@ -123,7 +125,8 @@ class JsonRpc:
             error = answer["error"]
             said = error.get("message", error) if isinstance(error, dict) else error
             raise CommandRefused(
-                f"{self._name} refuses {method}: {one_line(Exception(said))}; correct the call, or update its firmware"
+                f"{self._name} refuses {method}: {one_line(said)[:_MOST_SHOWN]}; correct the call, or update its "
+                "firmware"
             )
         if not isinstance(answer, dict) or "result" not in answer:
             raise ProtocolError(

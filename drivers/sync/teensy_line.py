@@ -15,6 +15,7 @@ from typing import Literal, cast
 from drivers.clock import now_s
 from drivers.errors import CommandRefused, DeviceError, DeviceTimeout, ProtocolError
 from drivers.interfaces import SyncStatus
+from drivers.transports.endpoints import printable
 from drivers.transports.serial_port import SerialPort
 
 USB_IDS = (0x16C0, 0x0483)
@@ -133,7 +134,7 @@ class TeensyLine:
                 break
             said, _, check = line.rpartition(b" *")
             if said.startswith(tag) and check == b"%08x" % zlib.crc32(said):
-                return said[len(tag) :].decode("ascii", "replace")
+                return printable(said[len(tag) :].decode("ascii", "replace"))
             if line and not line.startswith(_OF_BOARD):
                 self._heard = line
         return None

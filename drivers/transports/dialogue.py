@@ -24,6 +24,7 @@ from typing import Protocol
 
 from drivers.clock import Clock, now_s
 from drivers.errors import CommandRefused, DeviceError, DeviceFault, DeviceTimeout, ProtocolError
+from drivers.transports.endpoints import printable
 from drivers.transports.serial_port import SerialPort
 
 _log = logging.getLogger(__name__)
@@ -84,6 +85,8 @@ NUMBER = re.compile(r"[+-]?\d{1,9}(\.\d{1,9})?([eE][+-]?\d{1,2})?")
 _DONE = re.compile(DONE)
 _ANY = re.compile(".*")
 _ATTEMPTS = 3
+_MOST_SHOWN = 200
+"""Most characters of a device's own words in a message."""
 AGAIN_S = 0.1
 """Time for any sign of life after the question that is sent to a silent device. The answer to the question before it is
 one too."""
@@ -215,7 +218,8 @@ class Dialogue:
                     return reply
                 refusal = self._framing.refusal(reply)
                 if attempt and refusal is not None:
-                    raise CommandRefused(f"{self.name} refuses {command!r}: {refusal}; check its state and model")
+                    said = printable(refusal[:_MOST_SHOWN])
+                    raise CommandRefused(f"{self.name} refuses {command!r}: {said}; check its state and model")
             raise ProtocolError(f"{self.name} answered {command!r} with {reply[:40]!r}; check its cable and firmware")
 
     def ask_flag(self, command: str) -> bool:

@@ -31,9 +31,15 @@ class Endpoint:
     one are looked up."""
 
 
-def one_line(error: Exception) -> str:
-    """The text of another library's error as a single line."""
-    return " ".join(str(error).split())
+def printable(text: str) -> str:
+    """Text from a device, for messages and lists: what commands a terminal, and anything else that it cannot show, is
+    shown as its escape."""
+    return text if text.isprintable() else "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
+def one_line(said: object) -> str:
+    """The text of another library's error, or of a device, as a single line."""
+    return printable(" ".join(str(said).split()))
 
 
 def resolve(port: str, ports: Mapping[str, Endpoint]) -> Endpoint:

@@ -32,7 +32,7 @@ from drivers.errors import (
     DeviceTimeout,
     ProtocolError,
 )
-from drivers.transports.endpoints import UDEV_RULES
+from drivers.transports.endpoints import UDEV_RULES, printable
 from drivers.transports.tap import IN, OUT, Tap
 
 USBFS_HINT = "echo 256 | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
@@ -281,7 +281,7 @@ def _string(device: Any, index: int) -> str | None:
         text = usb.util.get_string(device, index)
     except (usb.core.USBError, ValueError, NotImplementedError):  # ValueError: pyusb's 'no languages', mostly EACCES
         return None
-    return str(text) if text is not None else None
+    return printable(str(text)) if text is not None else None
 
 
 def _libusb() -> Any:
