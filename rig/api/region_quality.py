@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.files.npy_files import load_array
 from rig.config.overrides import PathLike
 from rig.depth.quality import RegionQuality, RegionTally
 from rig.errors import DamagedRecordingError, UsageError
 from rig.progress import tell_stage
+from rig.run_folder.map_files import read_depth
 from rig.run_folder.pictures import ply_points
 
 
@@ -69,7 +69,7 @@ def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQ
 def _map_of(folder: Path, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Depth (rows, width) of a map, and points (n, 3) of its pixels with depth, row by row."""
     try:
-        depth_m = load_array(file)
+        depth_m = read_depth(file)
         points = ply_points((folder / "cloud" / f"{file.stem}.ply").read_bytes())
     except (OSError, ValueError) as error:
         raise DamagedRecordingError(

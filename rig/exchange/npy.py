@@ -14,12 +14,12 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_array, load_arrays
 from calibration.model.camera import Camera
 from drivers.frames import BlockHeader, FrameBlock, Mark
 from rig.errors import UsageError
 from rig.exchange.photoncube import SIDECAR_FORMAT, TRANSFORMS
 from rig.run_folder.folder import RunFolder
+from rig.run_folder.map_files import map_numbers, read_depth, read_stripe
 from rig.run_folder.plain_json import json_text
 
 CUBE: Final = "frames.npy"
@@ -180,7 +180,7 @@ class MapFiles:
 
     def __init__(self, run: Path) -> None:
         self._run = run
-        self.indices = sorted(int(file.stem) for file in run.glob("stripe/*.npz") if file.stem.isdigit())
+        self.indices = map_numbers(run)
 
     def files(self, folder: str, suffix: str) -> list[Path]:
         """Files of one kind (such as 'depth', '.npy') in the order of the maps."""
@@ -188,12 +188,12 @@ class MapFiles:
 
     def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
         """Stripe table of a map, (rows, columns) each, and depth_m (height, width) if the rig is calibrated."""
-        arrays = load(self._run / "stripe" / f"{index:06d}.npz", load_arrays)
+        arrays = load(self._run / "stripe" / f"{index:06d}.npz", read_stripe)
         file = self._run / "depth" / f"{index:06d}.npy"
-        return {**arrays, "depth_m": load(file)} if file.exists() else arrays
+        return {**arrays, "depth_m": load(file, read_depth)} if file.exists() else arrays
 
 
-def load(file: Path, read: Callable[[Path], Any] = load_array) -> Any:
+def load(file: Path, read: Callable[[Path], Any]) -> Any:
     """Load a file of numpy's. Raises UsageError, with one line, if that fails."""
     try:
         return read(file)

@@ -7,12 +7,20 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_arrays
 from drivers.frames import FrameBlock
 from rig.errors import UsageError
 from rig.exchange.npy import MapFiles, load
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.pictures import Picture, beside, confidence_picture, depth_limits, depth_picture, png_bytes
+from rig.run_folder.map_files import read_arrays, read_depth
+from rig.run_folder.pictures import (
+    Picture,
+    beside,
+    confidence_picture,
+    depth_limits,
+    depth_picture,
+    png_bytes,
+    read_grey,
+)
 from rig.scan.monitor import add_frames
 
 View = Literal["depth", "intensity", "frames"]
@@ -29,23 +37,29 @@ def map_pictures(maps: MapFiles, view: View) -> Iterator[Picture]:
 
     Raises UsageError if a file cannot be read."""
     if view == "intensity":
-        import cv2
-
         for file in maps.files("intensity", ".png"):
-            picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            if picture is None:
-                raise UsageError(f"{file} is no picture; make the maps again with rig reconstruct")
-            yield np.asarray(picture, np.uint8)
+            try:
+                yield read_grey(file)
+            except (OSError, ValueError) as error:
+                raise UsageError(f"{file}: {error}; make the maps again with rig reconstruct") from error
         return
     limits = None
     for file in maps.files("depth", ".npy"):
-        depth_m = load(file)
+        depth_m = load(file, read_depth)
         limits = limits or depth_limits(depth_m)
         picture = depth_picture(depth_m, limits)
         worth = file.parent.parent / "confidence" / f"{file.stem}.npz"
         if worth.exists():
-            picture = beside(picture, confidence_picture(load(worth, load_arrays)["confidence"]))
+            picture = beside(picture, confidence_picture(load(worth, _confidence)))
         yield picture
+
+
+def _confidence(file: Path) -> NDArray[np.float32]:
+    """The confidence of each pixel's depth. Raises OSError, ValueError."""
+    arrays = read_arrays(file)
+    if "confidence" not in arrays:
+        raise ValueError(f"{file.name} has no confidence")
+    return arrays["confidence"]
 
 
 def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Iterator[Picture]:

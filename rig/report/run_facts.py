@@ -6,12 +6,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from calibration.errors import CalibrationError
-from calibration.files.npy_files import load_array, load_arrays
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.errors import DeviceError
@@ -19,7 +14,8 @@ from drivers.recorded.contents import INDEX_FILE
 from rig.errors import RigError, UsageError
 from rig.recording.map_rows import MapRows, RowCounts
 from rig.run_folder.manifest import MANIFEST, read_manifest
-from rig.run_folder.pictures import Picture, intensity_picture
+from rig.run_folder.map_files import map_numbers, read_arrays, read_depth, read_stripe
+from rig.run_folder.pictures import Picture, intensity_picture, read_grey
 from rig.run_folder.runs import SUMMARY, read_summary
 from rig.simd import Float32
 
@@ -96,7 +92,7 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     manifest = reader.file(MANIFEST, _manifest, "the manifest") or {}
     summary = reader.file(SUMMARY, _summary, "the summary") or {}
     recorded = (folder / INDEX_FILE).exists()
-    numbers = tuple(sorted(int(file.stem) for file in folder.glob("stripe/*.npz") if file.stem.isdigit()))
+    numbers = tuple(map_numbers(folder))
     counted = _counted_maps(folder, reader) if recorded else None
     there = sorted({*numbers, *(counted.maps if counted is not None else ())})
     if number is not None and number not in there:
@@ -147,18 +143,18 @@ class _Reader:
 
 def _map_files(reader: _Reader, name: str, manifest: Mapping[str, Any]) -> dict[str, Any]:
     """All that is known of a map."""
-    found: dict[str, Any] = {"stripe": reader.file(f"stripe/{name}.npz", _stripe, "the stripe table") or {}}
+    found: dict[str, Any] = {"stripe": reader.file(f"stripe/{name}.npz", read_stripe, "the stripe table") or {}}
     if (reader.folder / "depth").is_dir():
-        found["depth_m"] = reader.file(f"depth/{name}.npy", _plane, "the depth map")
-        worth = reader.file(f"confidence/{name}.npz", load_arrays, "confidence and error of each pixel") or {}
+        found["depth_m"] = reader.file(f"depth/{name}.npy", read_depth, "the depth map")
+        worth = reader.file(f"confidence/{name}.npz", read_arrays, "confidence and error of each pixel") or {}
         for key in ("confidence", "depth_sd_m"):
             if key in worth:
-                found[key] = worth[key].astype(np.float32)
+                found[key] = worth[key]
     else:
         reader.missing.append("Without a calibration there is no depth.")
-    found["counts"] = reader.file(f"intensity/{name}.png", _grey, "the picture of the counts")
+    found["counts"] = reader.file(f"intensity/{name}.png", read_grey, "the picture of the counts")
     if (reader.folder / "truth").is_dir():
-        found["truth"] = reader.file(f"truth/{name}.npz", load_arrays, "the truth") or {}
+        found["truth"] = reader.file(f"truth/{name}.npz", read_arrays, "the truth") or {}
     elif ((manifest.get("config") or {}).get("world")) is None:
         reader.missing.append("No truth is known, as with any real scene, so errors are those that the map states.")
     else:
@@ -227,31 +223,6 @@ def _summary(file: Path) -> Mapping[str, Any]:
     if not file.exists():
         raise FileNotFoundError(file)
     return read_summary(file.parent)
-
-
-def _stripe(file: Path) -> dict[str, Float32]:
-    """A stripe table's arrays, all of one size."""
-    table = load_arrays(file)
-    if lacking := [name for name in ("x_px", "confidence", "signal", "haze") if name not in table]:
-        raise ValueError(f"{file.name} has no {', '.join(lacking)}")
-    if len({values.shape for values in table.values()}) > 1 or table["x_px"].ndim != 2:
-        raise ValueError(f"the arrays of {file.name} have different sizes")
-    return table
-
-
-def _plane(file: Path) -> Float32:
-    """An array with a value for each pixel."""
-    values = load_array(file)
-    if values.ndim != 2 or not values.size:
-        raise ValueError(f"{file.name} has the shape {values.shape}, not one of rows and columns")
-    return np.asarray(values, np.float32)
-
-
-def _grey(file: Path) -> NDArray[np.uint8]:
-    picture = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise ValueError(f"{file.name} is no picture")
-    return np.asarray(picture, np.uint8)
 
 
 def _moment(text: object) -> datetime | None:

@@ -11,12 +11,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.geometry.windows import WORD_PX
+from rig.run_folder.map_files import LARGEST
 
 Picture = NDArray[np.uint8]
 """Grey (rows, width) or RGB (rows, width, 3)."""
@@ -244,6 +246,40 @@ def round_values(low: float, high: float, most: int) -> list[float]:
     return [float(k * step) for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
+MOST_READ_PX: Final = 1 << 24
+"""Most pixels of a picture that is read, five times as many as the largest SPAD array has: a PNG of a megabyte can
+stand for a billion."""
+_PNG_CHUNKS, _PNG_AROUND = 8, 12
+"""Bytes before the first chunk, and those of a chunk around its content: its length and kind, and its checksum."""
+_PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR"
+
+
+def read_grey(file: Path) -> NDArray[np.uint8]:
+    """The grey picture, uint8 (rows, width), in a PNG file that a run wrote. Raises OSError if it cannot be read,
+    ValueError, with one line, if it is no such picture."""
+    import cv2
+
+    data = file.read_bytes()
+    picture = None
+    if 0 < _png_pixels(data) <= MOST_READ_PX:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise ValueError(f"{file.name} is no picture of at most {MOST_READ_PX >> 20} megapixels")
+    return np.asarray(picture, np.uint8)
+
+
+def _png_pixels(data: bytes) -> int:
+    """Number of pixels of a PNG file all of whose chunks lie within it; 0 for another one. OpenCV takes the memory that
+    a chunk asks for before it looks whether the file has so much."""
+    if not data.startswith(_PNG_HEAD):
+        return 0
+    at = _PNG_CHUNKS
+    while at < len(data):
+        at += _PNG_AROUND + int.from_bytes(data[at : at + 4], "big")
+    width, height = (int.from_bytes(data[len(_PNG_HEAD) + place :][:4], "big") for place in (0, 4))
+    return width * height if at == len(data) else 0
+
+
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
@@ -276,4 +312,5 @@ def ply_points(ply: bytes) -> NDArray[np.void] | None:
     """The points, of dtype POINT, of a file that `ply_bytes` made; None if it is another one."""
     header, end, body = ply.partition(b"end_header\n")
     whole = bool(end) and b"binary_little_endian" in header and len(body) % POINT.itemsize == 0
-    return np.frombuffer(body, POINT) if whole else None
+    points = np.frombuffer(body, POINT) if whole else None
+    return points if points is not None and (np.abs(points.view("<f4")) < LARGEST).all() else None

@@ -31,6 +31,8 @@ def plain(value: Any) -> Any:
         return plain(float(value))
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int | bool):
+    if value is None or isinstance(value, int | bool):
         return value
-    return str(value)
+    text = str(value)
+    # The name of a file may hold bytes that are no text, which no file can hold as they are.
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()

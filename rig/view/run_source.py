@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.files.npy_files import load_arrays
 from drivers.errors import DeviceError
 from drivers.recorded.segments import segment_files
 from rig.errors import DamagedRecordingError, RigError, UsageError
@@ -21,6 +20,7 @@ from rig.recording.inputs import holds_frames_alone, reconstruct_line
 from rig.recording.map_rows import MapRows, RowCounts
 from rig.recording.open import open_recording, require_recording
 from rig.run_folder.manifest import read_manifest
+from rig.run_folder.map_files import read_arrays
 from rig.run_folder.pictures import ply_points
 from rig.run_folder.runs import read_summary
 from rig.scan.monitor import add_frames
@@ -172,7 +172,8 @@ def read_map(folder: Path, number: int, rays: tuple[Float32, Float32] | None, ab
         counts[known] = found["intensity"]
         if rays is None:
             u, v = np.full_like(counts, np.nan), np.full_like(counts, np.nan)
-            u[known], v[known] = found["x"] / found["z"], found["y"] / found["z"]
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # what is not finite is no ray
+                u[known], v[known] = found["x"] / found["z"], found["y"] / found["z"]
             rays = u, v
     worth = _worth(folder, number, depth_m.shape)
     if not worth:  # a run that kept only the confidence of stripes
@@ -198,5 +199,5 @@ def _bytes(folder: Path, kind: str, number: int, suffix: str) -> bytes | None:
 def _worth(folder: Path, number: int, shape: tuple[int, ...]) -> dict[str, Float32]:
     """Confidence and standard deviation of each pixel's depth; empty if the run did not keep them."""
     file = folder / "confidence" / f"{number:06d}.npz"
-    arrays = load(file, load_arrays) if file.exists() else {}
-    return {name: array.astype(np.float32) for name, array in arrays.items() if array.shape == shape}
+    arrays = load(file, read_arrays) if file.exists() else {}
+    return {name: array for name, array in arrays.items() if array.shape == shape}

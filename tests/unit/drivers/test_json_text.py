@@ -42,6 +42,7 @@ def test_json_is_read_as_it_is_within_limits() -> None:
         "1e999",
         r'{"\u001b[2J": 1}',
         r'[{"a\nb": 1}]',
+        r'["\ud800"]',
     ],
 )
 def test_anything_else_is_a_value_error_of_one_line(text: str) -> None:
