@@ -6,6 +6,7 @@ Options that several commands have are defined here too.
 import errno
 import functools
 import inspect
+import json
 import os
 import re
 import sys
@@ -286,7 +287,7 @@ def print_json(content: Mapping[str, Any]) -> None:
     """Print the one JSON object of a command to stdout."""
     from rig.run_folder.plain_json import json_text
 
-    print(in_options(json_text(content)))
+    tell(in_options(json_text(content)))
 
 
 def show_page(*, stays: bool = False, required: bool = True) -> "subprocess.Popen[bytes] | None":
@@ -311,4 +312,18 @@ def say_space(space: "Space") -> None:
 
 def say(line: str) -> None:
     """Print a line for people to stderr."""
-    print(in_options(line), file=sys.stderr, flush=True)
+    print(plain(in_options(line)), file=sys.stderr, flush=True)
+
+
+def tell(text: str = "", end: str = "\n") -> None:
+    """Print text to stdout."""
+    print(plain(text), end=end)
+
+
+def plain(text: str) -> str:
+    """Text for a terminal. It may hold names and words from files and devices of strangers: characters that command a
+    terminal or turn the direction of writing are shown as their escapes, as in JSON."""
+    return _COMMANDING.sub(lambda found: json.dumps(found[0])[1:-1], text)
+
+
+_COMMANDING = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")

@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import EXIT_ABORTED, EXIT_DEVICE, CommandResult, Commands, ConfigArgument, api, asks, say, tables
+from rig.cli.command import (
+    EXIT_ABORTED,
+    EXIT_DEVICE,
+    CommandResult,
+    Commands,
+    ConfigArgument,
+    api,
+    asks,
+    say,
+    tables,
+    tell,
+)
 from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.requests import BatchRequest, SoakRequest
@@ -35,7 +46,7 @@ def bench_command(request: SoakRequest) -> CommandResult:
 
     def show() -> None:
         tables.speed_table(report)
-        print()
+        tell()
         tables.soak_table(stream)
 
     return CommandResult({**report.as_json(), "soak": asdict(stream)}, show, stream.exit_code)
@@ -46,7 +57,7 @@ def warmup_command(config: ConfigArgument = "simulated") -> CommandResult:
     with progress():
         seconds = api.warm_up(config)
     said = f"warm after {seconds:.1f} s; compiled code is kept on disk, once more takes seconds"
-    return CommandResult({"seconds": seconds}, lambda: print(said))
+    return CommandResult({"seconds": seconds}, lambda: tell(said))
 
 
 @asks(BatchRequest)
@@ -81,15 +92,15 @@ def batch_command(
 def _show_values(result: "Result") -> None:
     from rig.run_folder.plain_json import json_text
 
-    print(json_text(result))
+    tell(json_text(result))
 
 
 def _show_plan(plan: "BatchPlan") -> None:
     from rig.batch.engine import in_words
 
-    print(f"{plan.cases} cases, {plan.left} of them to be done")
+    tell(f"{plan.cases} cases, {plan.left} of them to be done")
     if plan.left:
-        print(f"a case takes {plan.case_s:.2g} s: {in_words(plan.wall_s)} with {plan.workers} at once")
+        tell(f"a case takes {plan.case_s:.2g} s: {in_words(plan.wall_s)} with {plan.workers} at once")
 
 
 def _show_batch(done: "BatchResult") -> None:
@@ -102,7 +113,7 @@ def _show_batch(done: "BatchResult") -> None:
         say(f"{failure.kind} ({failure.attempts} times): {failure.message}; to see it: {failure.command}")
     if len(batch.failures) > MOST_FAILURES:
         say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / 'failures.jsonl'}")
-    print(
+    tell(
         f"{batch.verdict}: {batch.done} of {batch.total} cases done, {batch.run} of them now, in "
         f"{in_words(batch.wall_s)} with {batch.workers} at once"
     )
@@ -110,7 +121,7 @@ def _show_batch(done: "BatchResult") -> None:
         say(batch.reason)
     if batch.verdict == "aborted":
         say("run the same command again to go on")
-    print(f"files: {done.folder}")
+    tell(f"files: {done.folder}")
 
 
 COMMANDS: Commands = {"bench": bench_command, "warmup": warmup_command, "batch": batch_command}

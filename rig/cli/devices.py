@@ -18,6 +18,7 @@ from rig.cli.command import (
     print_json,
     say,
     show_page,
+    tell,
 )
 from rig.cli.progress import progress
 from rig.errors import UsageError
@@ -34,7 +35,7 @@ def doctor_command(
     could_scan = all(one.ok for one in findings)
     lines = [f"{'ok  ' if one.ok else 'FAIL'}  {one.name:<12}{one.text}" for one in findings]
     content = {"could_scan": could_scan, "findings": [asdict(one) for one in findings]}
-    return CommandResult(content, lambda: print(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
+    return CommandResult(content, lambda: tell(in_options("\n".join(lines))), 0 if could_scan else EXIT_DEVICE)
 
 
 @asks(AlignRequest)
@@ -64,7 +65,7 @@ def align_command(
     code = EXIT_ABORTED if last is None else 0 if found.found else 1
     note = "no line stands out: check beam, focus and gate, or raise --power or --exposures" if code == 1 else ""
     said = "aborted before the first sweep was whole" if last is None else last.line
-    return CommandResult(found.as_json(), lambda: print(said), code, note)
+    return CommandResult(found.as_json(), lambda: tell(said), code, note)
 
 
 def devices_command() -> CommandResult:
@@ -74,7 +75,7 @@ def devices_command() -> CommandResult:
         found = api.devices()
     lines = [f"{one.address:<32}{one.what}" for one in found]
     said = "\n".join(lines or ["no USB device, card, network device or serial port that a driver knows is attached"])
-    return CommandResult({"devices": [asdict(one) for one in found]}, lambda: print(said))
+    return CommandResult({"devices": [asdict(one) for one in found]}, lambda: tell(said))
 
 
 def laser_off_command(config: ConfigArgument = "simulated") -> int:
@@ -82,7 +83,7 @@ def laser_off_command(config: ConfigArgument = "simulated") -> int:
     with progress():
         done = api.laser_off(config)
     for line in done:
-        print(line)
+        tell(line)
     return 0
 
 
@@ -91,7 +92,7 @@ def check_command(config: ConfigArgument = "simulated") -> CommandResult:
     with progress():
         checked = api.check_config(config)
     content = {"config": config, "name": checked.name, "valid": True}
-    return CommandResult(content, lambda: print(f"{config}: valid, rig '{checked.name}'"))
+    return CommandResult(content, lambda: tell(f"{config}: valid, rig '{checked.name}'"))
 
 
 def show_command(config: ConfigArgument = "simulated") -> CommandResult:
@@ -99,7 +100,7 @@ def show_command(config: ConfigArgument = "simulated") -> CommandResult:
     from rig.config.files import completed_text, config_content
 
     text = completed_text(config)
-    return CommandResult(config_content(text), lambda: print(text, end=""))
+    return CommandResult(config_content(text), lambda: tell(text, end=""))
 
 
 def schema_command() -> int:
@@ -119,9 +120,9 @@ def scenes_command() -> CommandResult:
 
     def show() -> None:
         for group, members in listed.items():
-            print(f"{group}:")
+            tell(f"{group}:")
             for one in members:
-                print(f"  {one.name:<{wide}}  {one.about}")
+                tell(f"  {one.name:<{wide}}  {one.about}")
 
     return CommandResult({group: [asdict(one) for one in members] for group, members in listed.items()}, show)
 

@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 
 from rig.cli import calibrate, computing, devices, recordings, scan, view
-from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say
+from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say, tell
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, besides Ctrl-C; no system has all of them."""
@@ -147,7 +147,7 @@ def _root(
     if version:
         from importlib.metadata import version as installed
 
-        print(f"spadrig {installed('spadrig')}")
+        tell(f"spadrig {installed('spadrig')}")
         raise typer.Exit(0)
     if context.invoked_subcommand is None:
         say(context.get_help())

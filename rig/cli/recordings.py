@@ -14,7 +14,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import CommandResult, Commands, ViewOption, api, asks, report, say, say_space, show_page, tables
+from rig.cli.command import (
+    CommandResult,
+    Commands,
+    ViewOption,
+    api,
+    asks,
+    report,
+    say,
+    say_space,
+    show_page,
+    tables,
+    tell,
+)
 from rig.cli.completion import among
 from rig.cli.progress import progress
 from rig.errors import UsageError
@@ -46,7 +58,7 @@ def repair_command(run: RunArgument) -> CommandResult:
         made = api.repair(run)
 
     def show() -> None:
-        print("\n".join(made.done or ["nothing was to be done"]))
+        tell("\n".join(made.done or ["nothing was to be done"]))
         _show_verification(made.after)
 
     return CommandResult(asdict(made), show, made.after.exit_code)
@@ -61,7 +73,7 @@ def example_command(
     if not made.as_published:
         say("warning: this computer rounds differently, so its frames are not the bits of the published recording")
     said = f"{made.folder}: {made.frames} frames, {made.bytes / 1e6:.2f} MB, sha256 of the frames {made.sha256}"
-    return CommandResult(made.as_json(), lambda: print(said))
+    return CommandResult(made.as_json(), lambda: tell(said))
 
 
 def info_command(run: RunArgument) -> CommandResult:
@@ -84,7 +96,7 @@ def cut_command(
     held = f"maps {first} to before {end}" if end > first else "no whole map"
     said = f"{out}: {content['recording']['blocks']} blocks, {held}"
     told = {"out": str(out), "recording": content["recording"], "cut": content["cut"]}
-    return CommandResult(told, lambda: print(said))
+    return CommandResult(told, lambda: tell(said))
 
 
 def compress_command(run: RunArgument) -> CommandResult:
@@ -93,7 +105,7 @@ def compress_command(run: RunArgument) -> CommandResult:
         made = api.compress(run)
     share = made.bytes_after / max(1, made.bytes_before)
     said = f"{made.segments} segments, {_megabytes(made.bytes_after)} ({share:.0%} of before)"
-    return CommandResult(asdict(made), lambda: print(said))
+    return CommandResult(asdict(made), lambda: tell(said))
 
 
 def _show_verification(found: "Verification") -> None:
@@ -105,8 +117,8 @@ def _show_verification(found: "Verification") -> None:
         say(f"start {run}: frames {first} to {last} were lost")
     if found.ended is not None:
         say(f"the recording ended before the run: {found.ended}")
-    print(f"{found.frames} frames in {found.blocks} blocks of {found.segments} segments are sound, {found.lost} lost")
-    print(f"{found.verdict.value}: {_ADVICE[found.verdict.value]}")
+    tell(f"{found.frames} frames in {found.blocks} blocks of {found.segments} segments are sound, {found.lost} lost")
+    tell(f"{found.verdict.value}: {_ADVICE[found.verdict.value]}")
 
 
 _ADVICE = {
@@ -119,19 +131,19 @@ _ADVICE = {
 
 def _show_info(found: "RecordingInfo") -> None:
     packed = f", {found.compressed} compressed" if found.compressed else ""
-    print(f"{found.folder}: run {found.verdict or 'of unknown verdict'}, {found.maps} maps, {found.frames} frames")
-    print(f"{found.segments} segments{packed}, {found.blocks} blocks, {_megabytes(found.bytes)}")
+    tell(f"{found.folder}: run {found.verdict or 'of unknown verdict'}, {found.maps} maps, {found.frames} frames")
+    tell(f"{found.segments} segments{packed}, {found.blocks} blocks, {_megabytes(found.bytes)}")
     for number, run in enumerate(found.runs):
         rate = "triggered from outside" if run.frame_rate_hz is None else f"{run.frame_rate_hz:.6g} Hz"
         maps = "no whole map" if run.first_map is None else f"maps {run.first_map} to {(run.end_map or 0) - 1}"
         gaps = f", {run.gaps} gaps of {run.lost} frames" if run.gaps else ""
-        print(
+        tell(
             f"start {number}: {_taken(run)}frames {run.first_frame} to {run.end_frame - 1}{gaps}, "
             f"{run.width} x {run.height} of {run.sensor_width} x {run.sensor_height}, {rate}, "
             f"{run.duration_s:.6g} s, {maps}"
         )
     for slot, name in found.devices.items():
-        print(f"{slot}: {name}")
+        tell(f"{slot}: {name}")
     for line in found.problems:
         say(line)
 
@@ -183,7 +195,7 @@ def record_command(
     state = record(_WISHES[wish], run)
     doing = "recording" if state.recording else "not recording"
     said = f"{state.run}: {doing}, {state.parts} part{'' if state.parts == 1 else 's'} so far"
-    return CommandResult(asdict(state), lambda: print(said))
+    return CommandResult(asdict(state), lambda: tell(said))
 
 
 _WISHES = {"on": True, "off": False, "state": None}
@@ -224,7 +236,7 @@ def report_command(
     def show() -> None:
         for line in made.missing:
             say(line)
-        print(f"{made.file}: {made.bytes / 1e6:.2f} MB")
+        tell(f"{made.file}: {made.bytes / 1e6:.2f} MB")
 
     return CommandResult(asdict(made), show)
 
@@ -286,9 +298,9 @@ def export_command(
 
 
 def _show_with_gaps(said: str, gaps: Iterable[tuple[int, int]]) -> None:
-    print(said)
+    tell(said)
     for first, last in gaps:
-        print(f"frames {first} to {last} are missing")
+        tell(f"frames {first} to {last} are missing")
 
 
 @asks(ReplayRequest)

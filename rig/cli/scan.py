@@ -21,6 +21,7 @@ from rig.cli.command import (
     say_space,
     show_page,
     tables,
+    tell,
 )
 from rig.cli.completion import one_of
 from rig.cli.progress import progress
@@ -75,7 +76,7 @@ def _of_plan(plan: "ScanPlan", estimator: str, space: "Space | None") -> Command
 
     recording = {} if space is None else {"recording": space.content()}
     said = f"{plan_text(plan)}\nestimator   {estimator}" + ("" if space is None else f"\nrecording   {space}")
-    return CommandResult({"plan": plan_content(plan), **recording}, lambda: print(said))
+    return CommandResult({"plan": plan_content(plan), **recording}, lambda: tell(said))
 
 
 @asks(ReconstructRequest)
@@ -125,7 +126,7 @@ def demo_command(
         with progress():
             shown = api.demonstrate(dated("demo-") if out is None else out, tell=say, on_space=say_space)
         tables.run_table(shown.replayed)
-        print(f"pictures are in {shown.folder / 'replay' / 'depth'}; next: rig view {shown.folder / 'recording'}")
+        tell(f"pictures are in {shown.folder / 'replay' / 'depth'}; next: rig view {shown.folder / 'recording'}")
         if page is not None and page.poll() is None:
             say("the page stays open; Ctrl-C ends it")
             with suppress(KeyboardInterrupt):

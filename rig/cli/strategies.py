@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from calibration.errors import digits
+from rig.cli.command import tell
 from rig.cli.tables import console
 
 if TYPE_CHECKING:
@@ -17,14 +18,14 @@ def strategies_tables(done: "Comparison") -> None:
         rows = [row for row in done.rows if (row.scene, row.air, row.rule) == (scene, air, rule)]
         named = scene if air is None else f"{scene}, {_air(air)}"
         _print(f"{named}, equal {rule}", rows)
-    print("Mean error in px, pixels within 2 % of the depth in %, confident wrong ones in %.")
-    print("A missing answer counts as 10 px. -: cannot measure in so short a time.\n")
+    tell("Mean error in px, pixels within 2 % of the depth in %, confident wrong ones in %.")
+    tell("A missing answer counts as 10 px. -: cannot measure in so short a time.\n")
     _print_ranges(done)
     _print_sources(done)
     for note in done.notes:
-        print(note)
+        tell(note)
     if done.folder is not None:
-        print(f"files: {done.folder}")
+        tell(f"files: {done.folder}")
 
 
 def _print(title: str, rows: "list[StrategyRow]") -> None:
@@ -39,7 +40,7 @@ def _print(title: str, rows: "list[StrategyRow]") -> None:
         table.add_row(name, *("" if row is None else _figures(row) for row in cells))
     console().print(title, style="bold", markup=False)
     console().print(table)
-    print()
+    tell()
 
 
 def _figures(row: "StrategyRow") -> str:
@@ -66,7 +67,7 @@ def _print_ranges(done: "Comparison") -> None:
             table.add_row(name, f"{time_ms:g}", rule, *("-" if of.get(a) is None else f"{of[a]:.1f}" for a in airs))
     console().print("Range in m: 90 % of the pixels at this depth are within 2 %", style="bold", markup=False)
     console().print(table)
-    print()
+    tell()
 
 
 def _print_sources(done: "Comparison") -> None:
@@ -82,7 +83,7 @@ def _print_sources(done: "Comparison") -> None:
         table.add_row(name, row.light, row.laser_class or "-", row.laser_class_still or "-", *seconds)
     console().print("Sources, and seconds of this computer with the simulation", style="bold", markup=False)
     console().print(table)
-    print()
+    tell()
 
 
 def _air(air: str) -> str:

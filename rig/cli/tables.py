@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from calibration.errors import digits
-from rig.cli.command import in_options
+from rig.cli.command import in_options, plain, tell
 from rig.run_folder.manifest import RunVerdict
 from rig.run_folder.runs import DAMAGED, RunEntry
 
@@ -56,13 +57,18 @@ def console(width: int | None = None) -> Console:
     return Console(highlight=False, width=width or (None if sys.stdout.isatty() else WIDE))
 
 
+def cell(text: str) -> Text:
+    """The content of a table's cell: plain text, in which rich finds no styles and links."""
+    return Text(plain(in_options(text)))
+
+
 def _print_pairs(pairs: Iterable[tuple[str, str]], width: int | None = None) -> None:
     """Print each name with its text beside it."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold")
     table.add_column()
     for pair in pairs:
-        table.add_row(*map(in_options, pair))
+        table.add_row(*map(cell, pair))
     console(width).print(table)
 
 
@@ -72,7 +78,7 @@ def _table(columns: "Columns[Row]", rows: Iterable[Row], *, left: Collection[str
     for name, _ in columns:
         table.add_column(name, justify="left" if name in left else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*(cell(row) for _, cell in columns))
+        table.add_row(*(cell(make(row)) for _, make in columns))
     return table
 
 
@@ -122,7 +128,7 @@ def effects_table(scene: "SceneEffects") -> None:
         )
     console().print(table)
     most = scene.planned_for
-    print(
+    tell(
         f"left out together: <= {digits(scene.changed_decisions_bound, 2)} of decisions changed, for columns of up to "
         f"{most['exposures']:g} frames, {most['exposure_s'] * 1e3:g} ms and {most['power_w'] * 1e3:g} mW"
     )
@@ -130,9 +136,9 @@ def effects_table(scene: "SceneEffects") -> None:
 
 def flux_table(flux: "Flux") -> None:
     """Print the flux of an image row to stdout: one text line per pixel, with one value per effect."""
-    print("  ".join(f"{name:>12}" for name in flux))
+    tell("  ".join(f"{name:>12}" for name in flux))
     for x, *parts in zip(*flux.values(), strict=True):
-        print("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
+        tell("  ".join([f"{x:>12}", *(f"{part:>12.6g}" for part in parts)]))
 
 
 def _error_change(effect: "Effect") -> str:
@@ -265,13 +271,13 @@ def runs_table(runs: Sequence[RunEntry], without: str) -> None:
     without: what to print if there are none.
     """
     if not runs:
-        print(without)
+        tell(without)
         return
     numbers = ("maps", "K", "size")
     console(WIDE).print(_table(_RUNS, runs, left=[name for name, _ in _RUNS if name not in numbers], apart=2))
     damaged = sum(run.verdict == DAMAGED for run in runs)
     size = _size(sum(run.bytes for run in runs))
-    print(f"{len(runs)} runs, {size}" + (f", {damaged} damaged" if damaged else ""))
+    tell(f"{len(runs)} runs, {size}" + (f", {damaged} damaged" if damaged else ""))
 
 
 def _size(count: int) -> str:
@@ -347,22 +353,22 @@ def tradeoff_table(done: "Tradeoff") -> None:
 
     * marks rows on the Pareto front of error and sensor time, + those on the front of error and compute time.
     """
-    print(textwrap.fill(done.advice, WIDTH))
-    print()
+    tell(textwrap.fill(done.advice, WIDTH))
+    tell()
     for place in dict.fromkeys((*row.place, row.lines) for row in done.rows):
         rows = [row for row in done.rows if (*row.place, row.lines) == place]
         _print(_named(*place), _FIGURES, rows)
         if any(row.times_limit is not None for row in rows):
             _print(f"{_named(*place)}: beside what its light allows", _LIMITS, rows)
-    print("K: exposures of a column. < 1 px, miss.: answers so near, and missing ones.")
-    print(f"95 %: interval of the mean error, over {done.ci95_by}.")
-    print("*, +: nothing has less error in as little sensor time (*), compute time (+).")
+    tell("K: exposures of a column. < 1 px, miss.: answers so near, and missing ones.")
+    tell(f"95 %: interval of the mean error, over {done.ci95_by}.")
+    tell("*, +: nothing has less error in as little sensor time (*), compute time (+).")
     if any(not row.counts for row in done.rows):
-        print("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
+        tell("In brackets: more than 5 % of the answers are missing, such an error counts for\nnothing.")
     for reason in done.accepted_calibration:
-        print(f"calibration accepted in spite of {reason}")
+        tell(f"calibration accepted in spite of {reason}")
     if done.folder is not None:
-        print(f"files: {done.folder}")
+        tell(f"files: {done.folder}")
 
 
 def _named(scene: str, fog: str | None, lines: int) -> str:
@@ -373,7 +379,7 @@ def _named(scene: str, fog: str | None, lines: int) -> str:
 def _print(title: str, columns: "Columns[TradeoffRow]", rows: "Sequence[TradeoffRow]") -> None:
     console().print(title, style="bold", markup=False)
     console().print(_table(columns, rows, left=_LEFT))
-    print()
+    tell()
 
 
 def _short(value: float | None) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.command import CommandResult, Commands, asks, say
+from rig.cli.command import CommandResult, Commands, asks, say, tell
 from rig.cli.progress import progress
 from rig.errors import UsageError
 from rig.requests import StreamRequest, ViewRequest
@@ -62,7 +62,7 @@ def stream_command(request: StreamRequest) -> CommandResult:
 
     counts = serve(request, ready=ready)
     said = f"{counts.clients} clients were served {counts.maps_sent} maps, {counts.refused} were refused"
-    return CommandResult({"address": address[0], **asdict(counts)}, lambda: print(said))
+    return CommandResult({"address": address[0], **asdict(counts)}, lambda: tell(said))
 
 
 COMMANDS: Commands = {"view": view_command, "stream": stream_command}
