@@ -30,9 +30,6 @@ from rig.plan.scan_plan import MAX_CLOCK_ERROR, ScanPlan
 
 MAX_RESIDUAL_COLUMNS = 0.05
 """Largest distance of a marker from the straight line, point over time, that is fitted to a synchronised sweep."""
-MOST_UNLIT = 1
-"""Most frames of a synchronised sweep that lie on columns with the gate low throughout. The plan opens the gate a whole
-frame early and closes it a whole frame late, so there are none; a flipped bit makes one."""
 MOST_OUT_OF_TURN = 1000
 """Most frames during a sweep that may name another sweep which cannot have begun. Flipped bits cause a few; more mean
 that the marker's line or the link is faulty."""
@@ -82,8 +79,9 @@ class SweepClock:
     standard deviation of that distance if it is larger; NaN if that pattern was not found. markers: number of markers
     or patterns that the clock is fitted to. first_frame, end_frame: numbers of the first frame of this sweep and of the
     next one. wrong_way: number of lit frames in which the scanner's direction signal was not the plan's. unlit: number
-    of frames on columns in which the gate was low throughout: markers and gate contradict each other. detection:
-    chance that a pattern as bright as this sweep's is found, 0 if it was not; None if markers were used.
+    of frames on columns in which the gate was low throughout. The plan opens it a whole frame early and closes it a
+    whole frame late, so there are none unless markers and gate contradict each other. detection: chance that a pattern
+    as bright as this sweep's is found, 0 if it was not; None if markers were used.
     """
 
     sweep: int
@@ -103,7 +101,7 @@ class SweepClock:
             self.residual_columns <= MAX_RESIDUAL_COLUMNS
             and abs(self.clock_error) <= MAX_CLOCK_ERROR
             and self.wrong_way == 0
-            and self.unlit <= MOST_UNLIT
+            and self.unlit == 0
         )
 
 

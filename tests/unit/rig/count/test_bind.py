@@ -266,7 +266,7 @@ def test_a_scan_marker_beside_a_gate_edge_does_not_say_where_in_its_frame_it_is(
     assert bind(plan, whole(stream))[1][0].synchronised
 
 
-@pytest.mark.parametrize("late", [-4, 4])
+@pytest.mark.parametrize("late", [-3, 3])
 def test_markers_that_contradict_the_gate_flag_the_sweep(late):
     plan = plan_of(scan(exposures=8))
     stream = stream_of(plan, 2)
@@ -274,5 +274,5 @@ def test_markers_that_contradict_the_gate_flag_the_sweep(late):
     gate = np.uint32(Mark.GATE_HIGH | Mark.GATE_EDGE)
     stream.records["marks"] = stream.records["marks"] & ~gate | np.roll(stream.records["marks"] & gate, late)
     _, clocks = bind(plan, whole(stream))
-    assert [clock.unlit > 1 for clock in clocks] == [True, True]
+    assert [clock.unlit > 0 for clock in clocks] == [True, True]
     assert not any(clock.synchronised for clock in clocks)
