@@ -25,7 +25,7 @@ from rig.config.overrides import PathLike
 from rig.errors import DamagedRecordingError, RecordingError, UsageError
 from rig.progress import tell_stage
 from rig.recording.verify import Integrity, examine
-from rig.run_folder.disk import sync_folder
+from rig.run_folder.disk import new_file, sync_folder
 from rig.run_folder.manifest import UNFINISHED
 
 LEVEL: Final = 3
@@ -83,7 +83,7 @@ def _compress(segment: PlainSegment, offsets: list[int]) -> None:
     scratch = packed.with_name(f"{packed.name}.part")
     sizes: list[tuple[int, int]] = []
     try:
-        with scratch.open("wb") as file:
+        with new_file(scratch) as file:
             for begin, end in pairwise(sorted({0, *offsets, segment.size})):  # bytes before the first block too
                 plain = segment.at(begin, end - begin)
                 frame = packer.compress(plain.data)

@@ -17,13 +17,13 @@ import numpy as np
 
 from drivers.errors import CorruptBlock
 from drivers.recorded.contents import INDEX_FILE, INDEX_RECORD, index_header, round_up_to_page, segment_name
-from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader
+from drivers.recorded.segments import PACKED_SUFFIX, PlainSegment, SegmentReader, segment_files
 from rig.config.overrides import PathLike
 from rig.errors import RecordingError, UsageError
 from rig.recording.check import FRAMES_SEAL, sealed
 from rig.recording.verify import Examination, Verification, examine, verify
 from rig.recording.writer import RESERVE_FILE
-from rig.run_folder.disk import is_held, replace_file, sync_folder
+from rig.run_folder.disk import is_held, new_file, replace_file, sync_folder
 from rig.run_folder.manifest import MANIFEST, UNFINISHED, RunVerdict, device_counters, ended_early, sealed_text
 
 _PIECE_BYTES: Final = 1 << 24
@@ -47,6 +47,8 @@ def repair(run: PathLike) -> Repair:
     folder = Path(run)
     if is_held(folder / INDEX_FILE):
         raise UsageError(f"{folder} is still being recorded; let the run end, or end it, and repair it then")
+    if links := [file.name for file in segment_files(folder).values() if file.is_symlink()]:
+        raise UsageError(f"{folder}: {links[0]} is a link, and a repair changes files in place; repair a copy")
     found = examine(folder)
     done: list[str] = []
     try:
@@ -100,7 +102,7 @@ def _clear(segment: SegmentReader, blocks: list[Range], done: list[str]) -> None
     others = [(a, used) for a, b in _between(blocks, segment.size) if (used := _used(segment, a, b)) > a]
     if others:
         torn = _free(segment.path.with_suffix(".torn"))
-        with torn.open("wb") as copy:
+        with new_file(torn) as copy:
             _copy(segment, others, copy)
         done.append(f"{segment.path.name}: {len(others)} pieces that are no sound block are kept in {torn.name}")
     if not blocks:
@@ -130,7 +132,7 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
     torn = _free(plain.with_suffix(f".torn{PACKED_SUFFIX}"))
     if blocks:
         scratch = plain.with_name(f"{plain.name}.part")
-        with scratch.open("wb") as file:
+        with new_file(scratch) as file:
             file.truncate(end)
             _copy(segment, blocks, file)
         scratch.replace(plain)
@@ -141,10 +143,10 @@ def _unpack(segment: SegmentReader, blocks: list[Range], done: list[str]) -> Non
 
 
 def _free(path: Path) -> Path:
-    """The path, with a number in its name if the file exists: what an earlier repair kept stays as it is."""
+    """The path, with a number in its name if the file or link exists: what an earlier repair kept stays as it is."""
     stem, _, rest = path.name.partition(".")
     numbered = (path.with_name(f"{stem}-{number}.{rest}") for number in count(1))
-    return next(one for one in chain([path], numbered) if not one.exists())
+    return next(one for one in chain([path], numbered) if not os.path.lexists(one))
 
 
 def _is_damaged(segment: SegmentReader, begin: int, stop: int) -> bool:

@@ -6,6 +6,7 @@ It imports nothing heavy, so that commands which only look at such files start q
 import os
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 try:
     import fcntl
@@ -38,13 +39,23 @@ def is_held(file: Path) -> bool:
     return False
 
 
+def new_file(file: Path) -> BinaryIO:
+    """Open a new file to be written, in the place of one that is there. Raises OSError.
+
+    A link there is removed, not followed: a folder may come from somebody who would like to have another file
+    overwritten.
+    """
+    file.unlink(missing_ok=True)
+    return file.open("xb")
+
+
 def replace_file(file: Path, data: bytes) -> None:
     """Write a file in one step. However the program ends, the file has either its old or its complete new content.
     Raises OSError.
     """
     scratch = file.with_name(f"{file.name}.part")
     try:
-        with scratch.open("wb") as stream:
+        with new_file(scratch) as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())

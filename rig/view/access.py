@@ -23,6 +23,8 @@ from rig.errors import UsageError
 
 FEWEST_TOKEN_CHARACTERS: Final = 16
 _TOKEN = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
+_HOST = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?")
+"""Form of the header Host: a name or a number, and a port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +131,8 @@ class Access:
         return [value for name, _, value in pairs if name == self.cookie]
 
     def _is_here(self, host: str) -> bool:
+        if _HOST.fullmatch(host) is None:  # it stands in the answer's security policy too
+            return False
         try:
             name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
         except ValueError:

@@ -1,27 +1,37 @@
 """Files and requests of strangers: what `tests.campaigns.inputs` and a reader who meant harm have found."""
 
 import json
+import re
+import struct
 import time
+import zlib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from drivers.errors import ProtocolError
+from drivers.errors import CommandRefused, DeviceError, ProtocolError
 from drivers.replay.spad import recorded_info
 from rig.api import cut, import_frames
+from rig.cli.main import app
 from rig.config.files import load_config
 from rig.errors import DamagedRecordingError, RigError, UsageError
 from rig.recording.inputs import write_inputs
 from rig.recording.open import info, open_recording
+from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.requests import RunsRequest
 from rig.run_folder.manifest import MANIFEST, file_crc32, read_manifest, sealed_text
+from rig.run_folder.map_files import map_numbers, read_arrays, read_depth
+from rig.run_folder.pictures import png_bytes, read_grey
 from rig.run_folder.runs import DAMAGED, list_runs
 from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
 from rig.view.access import Access, Asked
 from rig.view.pages import PageWish
+from tests.campaigns.inputs import wires
 from tests.unit.rig.count.streams import plan_of, rig_model, scan
 from tests.unit.rig.recording.recorded import record, run_blocks
 
@@ -130,3 +140,139 @@ def test_a_request_of_odd_bytes_is_refused_like_any_other(path: str, cookie: str
 def test_a_number_beyond_all_bounds_is_no_wish(least: str) -> None:
     with pytest.raises(ValueError):
         PageWish.parse(1, f'{{"ask": "confidence", "least": {least}}}')
+
+
+@pytest.mark.parametrize("name", ["manifest.json.part", "frames.idx.part", "frames-000000.torn"])
+def test_a_repair_follows_no_link_to_another_file(tmp_path: Path, name: str) -> None:
+    folder = recording(tmp_path / "run")
+    for file in (folder / MANIFEST, folder / "frames.idx"):
+        file.write_bytes(file.read_bytes()[:-40])
+    with (folder / "frames-000000.spb").open("ab") as segment:
+        segment.write(b"x" * 100)
+    for exists in (True, False):
+        victim = tmp_path / f"victim-{exists}"
+        if exists:
+            victim.write_text("mine")
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(victim)
+        repair(folder)
+        assert victim.exists() == exists
+        assert not exists or victim.read_text() == "mine"
+
+
+def test_a_repair_changes_no_file_elsewhere(tmp_path: Path) -> None:
+    folder, other = recording(tmp_path / "run"), recording(tmp_path / "other")
+    segment, target = folder / "frames-000000.spb", other / "frames-000000.spb"
+    with target.open("ab") as file:
+        file.write(b"x" * 100)
+    before = target.read_bytes()
+    segment.unlink()
+    segment.symlink_to(target)
+    with pytest.raises(UsageError, match=r"frames-000000\.spb is a link, .*repair a copy"):
+        repair(folder)
+    assert target.read_bytes() == before
+
+
+def _picture(change: str) -> bytes:
+    """A small picture whose header says something else, with the right checksum."""
+    png = bytearray(png_bytes(np.zeros((4, 8), np.uint8)))
+    if change == "pixels":
+        struct.pack_into(">II", png, 16, 60_000, 60_000)
+        struct.pack_into(">I", png, 29, zlib.crc32(png[12:29]))
+    if change == "chunk":
+        struct.pack_into(">I", png, 33, 0x7F000000)
+    return bytes(png)
+
+
+def test_a_picture_takes_no_more_memory_than_a_map_has(tmp_path: Path) -> None:
+    file = tmp_path / "000000.png"
+    file.write_bytes(_picture(""))
+    assert read_grey(file).shape == (4, 8)
+    for change in ("pixels", "chunk"):
+        file.write_bytes(_picture(change))
+        with pytest.raises(ValueError, match="no picture"):
+            read_grey(file)
+
+
+def test_numbers_of_maps_that_mean_nothing_are_no_estimate(tmp_path: Path) -> None:
+    file = tmp_path / "depth.npy"
+    np.save(file, np.array([[1.0, 1e300, -np.inf, np.nan]]))
+    assert np.array_equal(read_depth(file), np.float32([[1, np.nan, np.nan, np.nan]]), equal_nan=True)
+    for array in (np.array([["a"]]), np.zeros((1, 1), [("a", "u1")])):
+        np.save(file, array)
+        with pytest.raises(ValueError, match="no numbers"):
+            read_depth(file)
+    np.savez(tmp_path / "worth.npz", confidence=np.array([[0.5, 1e30]]))
+    assert np.isnan(read_arrays(tmp_path / "worth.npz")["confidence"]).tolist() == [[False, True]]
+
+
+def test_a_file_named_by_a_superscript_is_no_map(tmp_path: Path) -> None:
+    (tmp_path / "stripe").mkdir()
+    for name in ("000001", "\u00b2", "\u0663", "x"):
+        (tmp_path / "stripe" / f"{name}.npz").touch()
+    assert map_numbers(tmp_path) == [1]
+
+
+@pytest.mark.parametrize("command", ["runs", "info", "verify", "report", "doctor"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_words_of_strangers_command_no_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], command: str, options: list[str]
+) -> None:
+    evil = "\x1b[2J\x9b31m\x07[/bold] [link=http://evil.example]see\u202e <script>\r"
+    devices = {"spad": {"identity": evil, "name": evil}}
+    folder = recording(tmp_path / "run", note=evil, tags=[evil], command=evil, devices=devices, config={"name": evil})
+    (folder / "summary.json").write_text(json.dumps({"estimator": evil, "verdict": evil}))
+    if command == "doctor":
+        folder = tmp_path / "rig.yaml"
+        folder.write_text(yaml.safe_dump({"name": evil, "world": {"kind": evil, "scene": evil}}))
+    with pytest.raises(SystemExit):
+        app([command, str(tmp_path if command == "runs" else folder), *options])
+    said = "".join(capfd.readouterr())
+    assert said
+    assert not set(said) & set("\x1b\x9b\x07\u202e\r")
+    page = tmp_path / "run-report.html"
+    assert page.exists() == (command == "report")
+    assert not page.exists() or "<script>" not in page.read_text()
+
+
+def refused(parse: Any, answers: list[bytes]) -> DeviceError:
+    """The error that a driver ends with on these answers, in one line that a terminal can show."""
+    with pytest.raises(DeviceError) as ended:
+        parse(wires.pack(answers))
+    assert str(ended.value).isprintable()
+    return ended.value
+
+
+def test_an_answer_without_its_second_half_is_a_wrong_answer() -> None:
+    target = next(target for target in wires.TARGETS if target.name == "prawndo")
+    halved = partial(re.sub, rb"run-status:\d clock-status:\d", b"run-status clock-status")
+    answers = list(map(halved, wires.unpack(target.seeds()[0])))
+    assert b"run-status clock-status" in b"".join(answers)
+    assert isinstance(refused(target.parse, answers), ProtocolError)
+
+
+def test_an_endless_version_is_none() -> None:
+    target = next(target for target in wires.TARGETS if target.name == "pulsestreamer")
+    answers = [each.replace(b"1.7.0", b"9" * 5000 + b".7.0") for each in wires.unpack(target.seeds()[0])]
+    assert "no version" in str(refused(target.parse, answers))
+
+
+def test_numbers_of_a_spad512s_are_finite() -> None:
+    target = next(target for target in wires.TARGETS if target.name == "spad512s")
+    answers = [each.replace(b"1e6", b"nan") for each in wires.unpack(target.seeds()[0])]
+    assert isinstance(refused(target.parse, answers), ProtocolError)
+
+
+def test_words_of_a_device_command_no_terminal() -> None:
+    target = next(target for target in wires.TARGETS if target.name == "cobolt")
+    answers = list(wires.unpack(target.seeds()[0]))
+    for each in range(len(answers)):
+        with_escape = [*answers[:each], *[b"Syntax error: \x1b[2J\x07\r\n"] * 6, *answers[each:]]
+        if isinstance(refused(target.parse, with_escape), CommandRefused):
+            return
+    pytest.fail("no answer was taken for a refusal")
+
+
+def test_strings_of_a_usb_device_command_no_terminal() -> None:
+    target = next(target for target in wires.TARGETS if target.name == "usb-strings")
+    target.parse(wires.pack([text.encode("utf-16-le") for text in ("\x1b[2J", "SPB1\n\u2028")]))

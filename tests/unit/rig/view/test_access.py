@@ -35,7 +35,8 @@ def test_on_loopback_its_names_are_answered_at_any_port_that_leads_here(host: st
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example", "evil.example:8765", "127.0.0.1.evil.example", "10.0.0.7:8765", "localhost.evil.example", "", "["],
+    ["evil.example", "evil.example:8765", "127.0.0.1.evil.example", "10.0.0.7:8765", "localhost.evil.example", "", "[",
+     "127.0.0.1:8765; script-src *", "a@127.0.0.1", "127.0.0.1:8765\r\nX: y", "127.0.0.1/", "[::1]@evil.example"],
 )  # fmt: skip
 @pytest.mark.parametrize("socket", [False, True])
 def test_a_foreign_name_is_refused_also_when_it_leads_here(host: str, socket: bool) -> None:
