@@ -22,7 +22,7 @@ import unicodedata
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -155,6 +155,8 @@ def fuzz(target: Target, inputs: int, seed: int, most_s: float = math.inf) -> Fo
     """Try so many inputs, or as many as `most_s` of processor time allows. The seeds come first, and must be taken."""
     draw, found, ends_s = random.Random(seed), Found(), time.process_time() + most_s
     corpus = list(target.seeds())
+    with suppress(*target.errors):
+        target.parse(corpus[0])  # loads what is loaded once, which takes longer than any input may
     with strict():
         for data in corpus:
             name, shape, wrong = ending(target, data)
