@@ -3,7 +3,7 @@
 Loading the program takes a moment. Ctrl-C while it loads ends it as at any other time: with one line and exit code 4.
 """
 
-import sys
+from spadrig.__main__ import end_unloaded
 
 
 def main() -> None:
@@ -11,8 +11,7 @@ def main() -> None:
     try:
         from rig.cli.main import main as command_line
     except KeyboardInterrupt:
-        sys.stderr.write("aborted\n")
-        sys.exit(4)
+        end_unloaded(4, "aborted", "aborted")
     command_line()
 
 

@@ -58,15 +58,15 @@ def main(argv: Sequence[str] | None = None) -> None:
             code = app(args=arguments, prog_name="rig", standalone_mode=False)
         except (KeyboardInterrupt, Exception) as error:
             code = _say_why(error, arguments)
+        if argv is None:
+            _ignore_interrupts()
         if code == _TYPER_INTERRUPTED:  # an interrupt before a command had begun, or a second one while it ended
             code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
-    if argv is None and code == EXIT_ABORTED:
-        _ignore_interrupts()
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _ignore_interrupts() -> None:
-    """Ignore interrupts from now on: only threads have yet to end, and the exit code is known."""
+    """Ignore interrupts from now on: the command is done, and its exit code says what came of it."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
@@ -93,7 +93,8 @@ def _signals_interrupt() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is interrupt:
+                signal.signal(number, handler)
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:

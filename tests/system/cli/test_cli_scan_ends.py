@@ -1,6 +1,7 @@
 """How `rig scan` ends where it does not end well: lost frames, full disks, interrupts, mistakes of the program."""
 
 import dataclasses
+import json
 import os
 import signal
 import subprocess
@@ -132,7 +133,8 @@ def test_ctrl_c_in_a_scan_within_another_command_ends_that_in_one_line(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_further_signals_change_nothing_of_how_an_aborted_command_ends(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("then", "ended"), [("raise KeyboardInterrupt", (4, "aborted\n")), ("return []", (0, ""))])
+def test_further_signals_change_nothing_of_how_a_command_has_ended(then: str, ended: tuple[int, str]) -> None:
     program = (
         "import atexit, os, signal\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -140,12 +142,12 @@ def test_further_signals_change_nothing_of_how_an_aborted_command_ends(tmp_path:
         "atexit.register(lambda: [os.kill(os.getpid(), number) for number in (signal.SIGINT, signal.SIGTERM)])\n"
         "from rig import api\n"
         "from rig.cli.main import main\n"
-        "def interrupted(*given, **options): raise KeyboardInterrupt\n"
-        "api.effects = interrupted\n"
+        f"def found(*given, **options): {then}\n"
+        "api.runs = found\n"
         "main()\n"
     )
-    ran = subprocess.run([sys.executable, "-c", program, "effects"], capture_output=True, text=True, timeout=60)
-    assert (ran.returncode, ran.stderr) == (4, "aborted\n")
+    ran = subprocess.run([sys.executable, "-c", program, "runs", "--json"], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stderr) == ended
 
 
 def test_an_interrupt_before_a_command_has_begun_is_one_too(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,16 +159,20 @@ def test_an_interrupt_before_a_command_has_begun_is_one_too(rig: Rig, monkeypatc
     assert (ran.code, ran.err) == (4, "aborted\n")
 
 
-def test_an_interrupt_while_the_program_is_loaded_is_one_too() -> None:
+@pytest.mark.parametrize("loaded", ["rig.kernel_cache", "typer"])
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_an_interrupt_while_the_program_is_loaded_is_one_too(loaded: str, options: list[str]) -> None:
     program = (
         "import sys\n"
         "class Interrupts:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'typer':\n"
+        f"        if name == '{loaded}':\n"
         "            raise KeyboardInterrupt\n"
         "sys.meta_path.insert(0, Interrupts())\n"
-        "from rig.__main__ import main\n"
+        "from spadrig.__main__ import main\n"
         "main()\n"
     )
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    ran = subprocess.run([sys.executable, "-c", program, *options], capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stderr) == (4, "aborted\n")
+    printed = [json.loads(line) for line in ran.stdout.splitlines()]
+    assert printed == [{"error": {"code": 4, "problems": ["aborted"]}} for _ in options]
