@@ -6,9 +6,10 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Images of containers often set it. Then each of the hundreds of processes that tests start compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo help install test checks kernels lint types layers house docs figures collected unit clean
+.PHONY: demo help install test checks kernels lint types layers house docs figures collected unit audit clean
 .PHONY: packages pythons accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
+.PHONY: campaign-inputs
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed  ## scan the simulated rig in a foggy street
@@ -55,6 +56,13 @@ PYTEST = $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 unit: .venv/.installed-tests  ## the quick tests of single modules, for while you develop (90 s)
 	$(PYTEST) -m "not slow" tests/unit
 
+# With the network alone: it asks osv.dev about the packages in .venv. A package that it does not know fails it.
+AUDIT := .venv/audit
+audit: .venv/.installed-tests  ## known weaknesses of the packages in .venv, by pip-audit; needs the network
+	test -x $(AUDIT)/bin/pip-audit || { $(PYTHON) -m venv $(AUDIT) && $(AUDIT)/bin/python -m pip install --quiet pip-audit; }
+	$(BIN)/python -m pip freeze --exclude-editable > $(AUDIT)/packages.txt
+	$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip --vulnerability-service osv --requirement $(AUDIT)/packages.txt
+
 packages: .venv/.installed-tests  ## wheel and source distribution, installed and tried outside the checkout (ten minutes)
 	$(BIN)/python -m tests.campaigns.packages
 pythons: .venv/.installed-tests  ## the same on every Python found, and with the oldest dependencies allowed (an hour)
@@ -76,8 +84,8 @@ accuracy-calibration: .venv/.installed-tests  ## corners of drawn boards; camera
 	@test ! -d $(PICTURES) || $(BIN)/python -m tests.reference.boards.chessboards --folder $(PICTURES)
 
 # Without tests.campaigns.devices.guard_false_trips, which burns all processors: nothing else could be measured beside it.
-campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
-campaign:  ## the five below: what is tried at random (many hours)
+campaign: campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration campaign-inputs
+campaign:  ## the six below: what is tried at random (many hours)
 
 SEQUENCES ?= 10000
 campaign-devices: .venv/.installed-tests  ## SEQUENCES of faults on the wire of every driver; sweeps without markers; hardware in the loop
@@ -104,6 +112,9 @@ campaign-calibration: .venv/.installed-tests  ## RIGS calibrated, TRIALS of deli
 	$(BIN)/python -m tests.campaigns.calibration.fits || short=1; \
 	$(BIN)/python -m tests.campaigns.calibration.guided || short=1; \
 	exit $$short
+INPUTS ?= 1000000
+campaign-inputs: .venv/.installed-tests  ## INPUTS, or as many as 60 s of processor time allow, for every parser
+	$(BIN)/python -m tests.campaigns.inputs all --inputs $(INPUTS) --seconds 60
 
 .venv/.created:
 	@test -n "$(PYTHON)" || { echo "error: no python3 found; install Python 3.11 or newer, or call make PYTHON=/path/to/python" >&2; exit 2; }

@@ -285,7 +285,7 @@ def _places(node: yaml.Node, path: Key) -> Iterator[tuple[Key, int]]:
     """Every key and item below `node` with its line, repeated keys too."""
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
-            here = (*path, str(key.value))
+            here = (*path, key.value if isinstance(key.value, str) else "?")
             yield here, key.start_mark.line + 1
             yield from _places(value, here)
     elif isinstance(node, yaml.SequenceNode):
