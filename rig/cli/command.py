@@ -112,8 +112,7 @@ def command(function: Callable[..., int | CommandResult]) -> Callable[..., None]
         except KeyboardInterrupt as interrupt:
             code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], as_json)
         except Exception as error:
-            refused = refused_file(error)
-            found = EXIT_USAGE if refused else _code_of(error)
+            refused, found = refused_file(error), code_of(error)
             if found is None:
                 raise
             said, notes = (refused or str(error)).splitlines(), getattr(error, "__notes__", [])
@@ -250,6 +249,9 @@ _STEPS = {
     errno.EDQUOT: "free some space, or name a folder on another disk",
 }
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What the system says of a disk without room."""
+
 
 def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:
     """Say on stderr why a command has no result; with `as_json` also print it as one JSON object. Returns the code."""
@@ -262,11 +264,16 @@ def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: obje
     return code
 
 
-def _code_of(error: Exception) -> int | None:
+def code_of(error: BaseException) -> int | None:
+    """Exit code for an error; None if it is one in the program itself. A disk without room counts as a device."""
     from calibration.errors import CalibrationError
     from drivers.errors import DeviceError
     from rig.errors import RigError
 
+    if any(isinstance(each, OSError) and each.errno in _FULL for each in (error, error.__cause__)):
+        return EXIT_DEVICE
+    if refused_file(error):
+        return EXIT_USAGE
     if isinstance(error, RigError):
         return error.exit_code
     if isinstance(error, CalibrationError):

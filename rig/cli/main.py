@@ -19,7 +19,17 @@ from typing import Annotated
 import typer
 
 from rig.cli import calibrate, computing, devices, recordings, scan, view
-from rig.cli.command import EXIT_ABORTED, EXIT_SOFTWARE, EXIT_USAGE, add_commands, fail, refused_file, say, tell
+from rig.cli.command import (
+    EXIT_ABORTED,
+    EXIT_SOFTWARE,
+    EXIT_USAGE,
+    add_commands,
+    code_of,
+    fail,
+    refused_file,
+    say,
+    tell,
+)
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, besides Ctrl-C; no system has all of them."""
@@ -104,7 +114,7 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
         return _TYPER_INTERRUPTED
     refused = refused_file(error)  # such as the shell's start-up file, which --install-completion changes
     if refused is not None:
-        return fail(EXIT_USAGE, [refused], [], as_json)
+        return fail(code_of(error) or EXIT_USAGE, [refused], [], as_json)
     # Some versions of typer contain click and others import it, so the class of click's errors is not fixed.
     if not hasattr(error, "format_message"):
         traceback.print_exception(error)

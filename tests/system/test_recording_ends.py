@@ -90,7 +90,7 @@ def test_a_disk_without_room_for_a_map_leaves_every_whole_sweep_that_was_recorde
 ) -> None:
     with monkeypatch.context() as patch:
         fill_disk_at_map(1, patch)
-        assert rig("scan", small, *SCAN).code == 2
+        assert rig("scan", small, *SCAN).code == 3
     assert content("summary.json")["maps"] == 1
     assert_as_after_a_crash(rig, 1)
 

@@ -175,7 +175,7 @@ def test_a_full_disk_is_one_line_whoever_meets_it(rig: Rig, monkeypatch: pytest.
 
     monkeypatch.setattr("rig.api.devices", full)
     ran = rig("devices")
-    assert ran.code == 2
+    assert ran.code == 3
     assert ran.problems == [
         "error: cannot use the disk: No space left on device; free some space, or name a folder on another disk"
     ]
