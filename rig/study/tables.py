@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, TypeGuard
 
 from calibration.errors import digits
-from rig.batch.store import Row, read_failures, read_rows
+from rig.batch.store import LIST, Row, read_failures, read_rows
 from rig.errors import UsageError
 from rig.report.charts import Panel, Series, legend, panel_svg
 from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
@@ -78,7 +78,8 @@ def study_report(folder: Path) -> str:
         raise UsageError(f"{folder} has no finished case yet; run `rig batch` first")
     lines, labels = lines_of(rows)
     panels = panels_of(lines, labels)
-    total = sum(1 for _ in (folder / "cases.jsonl").open(encoding="utf-8"))
+    with (folder / LIST).open(encoding="utf-8") as stream:
+        total = sum(1 for _ in stream)
     whole = len(rows) == total
     said = f"{len(rows)} of {total} cases are done"
     columns = list(dict.fromkeys(key for line in lines for key in line))

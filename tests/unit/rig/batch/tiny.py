@@ -6,6 +6,7 @@ import subprocess
 import time
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 
 def square(x: int, sleep_s: float = 0.0) -> dict[str, Any]:
@@ -63,3 +64,10 @@ def parent(file: str) -> dict[str, Any]:
         Path(file).write_text(str(child.pid))
         child.wait()
     return {}
+
+
+def counted(x: int, counter: str, sleep_s: float) -> dict[str, Any]:
+    """A case that ends well, and leaves a file in the folder `counter` each time that it is done to its end."""
+    time.sleep(sleep_s)
+    (Path(counter) / f"{x}-{uuid4().hex}").touch()
+    return {"y": x * x, "text": "." * 200, "measured": {"at_s": time.time()}}

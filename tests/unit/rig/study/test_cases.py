@@ -1,0 +1,94 @@
+"""The cases of a study; what is wrong with a setting is said before any case is done."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig.batch.case import Case, files_of
+from rig.errors import UsageError
+from rig.study.cases import cases_of, kept_cases
+from rig.study.definition import load_study
+
+
+def cases(**content: Any) -> list[Case]:
+    """The cases of a study."""
+    return cases_of(load_study(content))
+
+
+def test_each_setting_is_done_with_each_seed() -> None:
+    made = cases(do="scan", set={"config": "small"}, vary={"exposures": [2, 4]}, repeat=2, seed=7)
+    assert [each.labels for each in made] == [
+        {"exposures": 2, "seed": 7}, {"exposures": 2, "seed": 8},
+        {"exposures": 4, "seed": 7}, {"exposures": 4, "seed": 8},
+    ]  # fmt: skip
+    assert {each.function for each in made} == {"rig.api.studies.cases:scan_once"}
+    assert [each.inputs["config"]["scan"]["exposures"] for each in made] == [2, 2, 4, 4]
+    assert [each.inputs["seed"] for each in made] == [7, 8, 7, 8]
+    assert {each.inputs["maps"] for each in made} == {1}
+    assert not any(each.keeps for each in made)
+
+
+def test_short_names_and_keys_of_the_config_are_set() -> None:
+    (made,) = cases(
+        do="scan", keep=True, set={"config": "small", "fog": "20m", "estimator": "edge", "scan.columns": 150, "maps": 3}
+    )
+    content = made.inputs["config"]
+    assert content["world"]["fog"] == "20m"
+    assert content["estimate"]["estimator"] == "edge"
+    assert content["scan"]["columns"] == 150
+    assert made.inputs["maps"] == 3
+    assert made.keeps
+    assert len(made.files) >= 1, "the calibration is read, so its contents are in the name of the case"
+    assert files_of(content) == made.files
+
+
+def test_poses_of_a_calibration() -> None:
+    (made,) = cases(do="calibrate", set={"config": "small"})
+    assert made.function == "rig.api.studies.cases:calibrate_once"
+    assert made.inputs["poses"] == 12
+
+
+def test_a_reconstruction_has_no_seed_and_reads_its_recording(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "manifest.json").write_text("{}")
+    recording = str(tmp_path / "run")
+    made = cases(do="reconstruct", set={"recording": recording}, vary={"estimator": ["edge", "joint"]}, repeat=3)
+    assert [each.labels for each in made] == [{"estimator": "edge"}, {"estimator": "joint"}]
+    assert made[0].inputs == {"recording": recording, "estimator": "edge"}
+    assert made[0].files == (recording,)
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ({"do": "scan", "set": {"config": "none"}}, "none"),
+        ({"do": "scan", "set": {"config": "small", "maps": 0}}, "maps is 0; it must be a whole number, at least 1"),
+        ({"do": "scan", "set": {"config": "small", "scene": "nowhere"}}, "nowhere"),
+        ({"do": "scan", "set": {"config": "small", "scan.columns": "wide"}}, "scan.columns"),
+        ({"do": "scan", "set": {"config": "lab-emulated"}}, "runs in the host's time"),
+        ({"do": "calibrate", "set": {"config": "small", "poses": 1.5}}, "poses is 1.5; it must be a whole number"),
+        ({"do": "reconstruct"}, "reconstruct needs the setting 'recording'"),
+        ({"do": "reconstruct", "set": {"recording": "/none"}}, "/none does not exist; correct the path"),
+        ({"do": "reconstruct", "set": {"recording": "/", "estimator": "auto"}}, "depends on the computer; name one"),
+        ({"do": "reconstruct", "set": {"recording": "/", "estimator": "x"}}, "estimator 'x' is unknown; choose one of"),
+        ({"do": "reconstruct", "set": {"recording": "/", "filter": "x"}}, "filter 'x' is unknown; choose one of"),
+        ({"do": "scan", "set": {"config": "small"}, "omit": [{"config": "small"}]}, "omit leaves all of them out"),
+    ],
+)
+def test_what_is_wrong_with_a_setting_is_one_line(content: dict[str, Any], line: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        cases(**content)
+    assert line in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_the_problems_of_all_settings_are_told_together() -> None:
+    with pytest.raises(UsageError) as refused:
+        cases(do="scan", set={"config": "small"}, vary={"maps": [0, 1, -3]})
+    assert [line[:8] for line in str(refused.value).splitlines()] == ["maps is ", "maps is "]
+
+
+def test_cases_are_left_out_by_their_labels() -> None:
+    made = [Case("a:b", {}, {"fog": fog}) for fog in ("clear", "20m")]
+    assert kept_cases(made, [{"fog": "clear"}]) == [False, True]
