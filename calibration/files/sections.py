@@ -171,6 +171,8 @@ def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> Y
     name: of the file in messages, by default its path. Raises FileError, also if a key is given twice.
     """
     name = str(file) if name is None else name
+    if "\0" in str(file):
+        raise FileError(f"cannot read {what.split()[-1]} {plain_text(name)}: it is no path; correct it")
     try:
         size = file.stat().st_size
         if size > MAX_BYTES:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 
 from rig.config.files import bundled_configs, load_config, parse_config
 from rig.config.models import MOST_LINES, Estimator, Filter, LinePower, RigConfig
@@ -54,7 +53,7 @@ def configure(
     for name, asked in (("scene", scene), ("fog", fog)):
         if asked is not None and loaded.world is None:
             raise UsageError(f"{name} {asked!r} was asked for, but {loaded.name} is a real rig; leave `{name}` out")
-    if scene is not None and scene in bundled_configs() and not Path(scene).expanduser().exists():
+    if scene is not None and scene in bundled_configs() and not os.path.exists(os.path.expanduser(scene)):
         raise UsageError(f"scene {scene!r} is a rig; give it as the config, without `scene`")
     given = {key: value for key, value in options.items() if value is not None}
     if not given:

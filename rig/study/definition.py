@@ -1,5 +1,6 @@
 """A study: the content of its YAML file, and the combinations of settings that it names."""
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -174,8 +175,8 @@ def _anchored_all(setting: Setting, folder: Path) -> Setting:
 def _anchored(key: str, value: Any, folder: Path) -> Any:
     if key not in PATHS or not isinstance(value, str):
         return value
-    path = folder / Path(value).expanduser()
-    return str(path) if path.exists() else value
+    path = folder / os.path.expanduser(value)
+    return str(path) if os.path.exists(path) else value
 
 
 def _in_a_line(where: str, error: Mapping[str, Any]) -> str:

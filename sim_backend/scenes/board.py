@@ -6,6 +6,7 @@ differently in every pixel. A pixel's depth is that of the ray through its centr
 camera's axis.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,7 @@ def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
     try:
         return [
             BoardAtPose(
-                load_board(BUNDLED_BOARD if one.file is None else folder / Path(one.file).expanduser()),
+                load_board(BUNDLED_BOARD if one.file is None else folder / os.path.expanduser(one.file)),
                 BoardPose(np.array(one.rotation), np.array(one.position)),
                 one.mirrored,
             )

@@ -117,7 +117,7 @@ def load_scene(name: str) -> tuple[SceneFile, Path]:
     wrong, with a line for each problem.
     """
     bundled = SCENE_FOLDER / f"{name}.yaml"
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))  # which leaves a user that does not exist as it is
     file = bundled if name in bundled_scenes() else path
     if os.path.isdir(file):  # unlike Path.is_dir, it accepts any text as a name
         return SceneFile(surfaces=str(file.resolve())), file
@@ -172,10 +172,10 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
         from sim_backend.scenes.board import board_scene, load_boards
 
         return board_scene(u, v, load_boards(scene.boards, folder), scene.wall)
-    path = folder / Path(scene.surfaces).expanduser()
+    path = folder / os.path.expanduser(scene.surfaces)
     if not path.is_dir():
         raise DeviceError(
-            f"surfaces {scene.surfaces!r}: {path} is no folder; name 'street', 'board' or a folder with a scene in it"
+            f"surfaces {scene.surfaces!r}: {str(path)!r} is no folder; name 'street', 'board' or a folder with a scene in it"
         )
     return load_folder(path, (u.shape[0], u.shape[1]))
 

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
+from calibration.board.board import load_board
+from calibration.errors import CalibrationError
 from drivers.errors import CommandRefused, DeviceError, ProtocolError
 from drivers.replay.spad import recorded_info
 from rig.api import cut, import_frames
@@ -28,9 +30,11 @@ from rig.run_folder.manifest import MANIFEST, file_crc32, read_manifest, sealed_
 from rig.run_folder.map_files import map_numbers, read_arrays, read_depth
 from rig.run_folder.pictures import png_bytes, read_grey
 from rig.run_folder.runs import DAMAGED, list_runs
+from rig.study.definition import load_study
 from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
 from rig.view.access import Access, Asked
 from rig.view.pages import PageWish
+from sim_backend.scenes.scene import SceneFile, load_scene, load_surfaces
 from tests.campaigns.inputs import wires
 from tests.unit.rig.count.streams import plan_of, rig_model, scan
 from tests.unit.rig.recording.recorded import record, run_blocks
@@ -276,3 +280,17 @@ def test_words_of_a_device_command_no_terminal() -> None:
 def test_strings_of_a_usb_device_command_no_terminal() -> None:
     target = next(target for target in wires.TARGETS if target.name == "usb-strings")
     target.parse(wires.pack([text.encode("utf-16-le") for text in ("\x1b[2J", "SPB1\n\u2028")]))
+
+
+@pytest.mark.parametrize("name", ["~no-such-user/scene.yaml", "a\0b"])
+def test_a_path_that_leads_nowhere_is_a_mistake_like_any_other(tmp_path: Path, name: str) -> None:
+    with pytest.raises(DeviceError, match="is no file, no folder and none of the bundled"):
+        load_scene(name)
+    scene = SceneFile(surfaces=name)
+    with pytest.raises(DeviceError, match="is no folder"):
+        load_surfaces(scene, tmp_path, np.zeros((2, 2)), np.zeros((2, 2)))
+    with pytest.raises(CalibrationError, match="cannot read board"):
+        load_board(name)
+    study = tmp_path / "study.yaml"
+    study.write_text(yaml.safe_dump({"do": "scan", "vary": {"scene": [name]}}))
+    assert load_study(study).vary == {"scene": [name]}

@@ -6,6 +6,7 @@ a visibility is always one of droplets that scatter light more than once, whatev
 light is that of the scene; a scene without any gets that of the bundled scenes.
 """
 
+import os
 from pathlib import Path
 from typing import Any, Final
 
@@ -83,7 +84,7 @@ def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, 
 
 def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     bundled = {each.name: each.file for each in bundled_scenes()}
-    path = bundled.get(scene, Path(scene).expanduser())
+    path = bundled.get(scene, Path(os.path.expanduser(scene)))
     if scene == RAMP:
         return {"surfaces": str(_ramp(model, folder))}
     if path.is_dir():

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from rig.config.bundled import BUNDLED
 from rig.config.files import completed_text, load_config, load_cube_plan
 from rig.devices.calibration_use import notes_on
 from rig.errors import UsageError
+from rig.study.definition import load_study
 from rig.tradeoff.files import tradeoff_report
-from sim_backend.scenes.scene import SCENE_FOLDER, load_folder, load_scene
+from sim_backend.scenes.board import load_boards
+from sim_backend.scenes.scene import SCENE_FOLDER, load_folder, load_scene, load_surfaces
 from tests.campaigns.inputs.changes import JSON, NPZ, YAML, Changes
 from tests.campaigns.inputs.files import in_file, npy, npz, scratch
 from tests.campaigns.inputs.fuzz import Target
@@ -31,7 +34,7 @@ from tests.system import small_rig
 _YAML_WORDS = (
     b"*a", b"&a", b"<<: *a\n", b"- ", b": ", b"|\n", b"!!binary ", b"!!set ", b"!!float ", b"!!int ",
     b"!!python/tuple ", b"{", b"[", b"? ", b"---\n", b"...\n", b"%YAML 9.9\n", b"'", b'"', b'"\\e[2J"', b"\t", b"10 us",
-    b"1e3 m", b"9/0 Hz",
+    b"1e3 m", b"9/0 Hz", b"~nobody/x", b"a\\0b", b"surfaces: ",
 )  # fmt: skip
 
 
@@ -79,10 +82,28 @@ def _config(file: Path) -> None:
 
 
 def _scene(file: Path) -> None:
+    """A scene, the boards and surfaces in it, and the file's words as the name of another one."""
     try:
-        load_scene(str(file))
+        scene, folder = load_scene(str(file))
+        load_boards(scene.boards, folder)
+        if scene.surfaces not in ("street", "board"):
+            load_surfaces(scene, folder, np.zeros((2, 2)), np.zeros((2, 2)))
+        with suppress(DeviceError):
+            load_scene(scene.surfaces)
     except DeviceError as error:  # of several lines, one for each problem
         raise UsageError(str(error)) from error
+
+
+def _studies() -> list[bytes]:
+    study = {"do": "scan", "vary": {"scene": ["street", "./street.yaml"], "exposures": [1, 3]}, "repeat": 2, "seed": 1}
+    study |= {"set": {"scan.columns": 100}, "also": [{"scene": "board"}], "omit": [{"exposures": 3}]}
+    return [_text(study | {"time_limit": "90 s", "memory_limit": "2 GB"})]
+
+
+def _study(file: Path) -> None:
+    made = load_study(file)
+    for _ in zip(made.combinations(), range(100), strict=False):
+        pass
 
 
 def _each_of(files: Path) -> Callable[[], list[bytes]]:
@@ -207,6 +228,7 @@ TARGETS = (
     Target(
         "scene", _each_of(SCENE_FOLDER), in_file("scene.yaml", _scene), changes=Changes(words=_YAML_WORDS, tree=YAML)
     ),
+    Target("study", _studies, in_file("study.yaml", _study), changes=Changes(words=_YAML_WORDS, tree=YAML)),
     Target(
         "board",
         lambda: [BUNDLED_BOARD.read_bytes()],
