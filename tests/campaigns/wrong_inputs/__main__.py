@@ -12,6 +12,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from tests.campaigns.wrong_inputs.inputs import CASES
@@ -27,15 +28,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--trials", type=int, default=20, help="of each case")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=list(CASES), choices=CASES, metavar="case")
-    parser.add_argument("--lines", help="file for one line of JSON per trial")
+    parser.add_argument(
+        "--lines", type=Path, help="file of one line of JSON per trial; trials that it has are not repeated"
+    )
     asked = parser.parse_args(arguments)
+    done = {} if asked.lines is None or not asked.lines.exists() else _told(asked.lines)
     table = Table(("case", "trials", "no depth, or error", "off by > 2 %", "of these caught", "caught in all", "by"))
     doubted = 0
     for name in asked.only:
         trials = []
-        for index in range(asked.trials):
-            trials.append(case(name, asked.seed * SEEDS_APART + index))
-            _tell(trials[-1], asked.lines)
+        for seed in range(asked.seed * SEEDS_APART, asked.seed * SEEDS_APART + asked.trials):
+            trials.append(done.get((name, seed)) or case(name, seed))
+            if (name, seed) not in done:
+                _tell(trials[-1], asked.lines)
         wrong = [trial for trial in trials if trial["wrong"]]
         by = Counter(_short(trial) for trial in trials if trial["caught"])
         table.add(
@@ -60,9 +65,14 @@ def _short(trial: dict[str, Any]) -> str:
     return trial["verdict"] if trial["verdict"] != "doubtful" else reason[:48]
 
 
-def _tell(trial: dict[str, Any], lines: str | None) -> None:
-    if lines:
-        with open(lines, "a", encoding="utf-8") as file:
+def _told(lines: Path) -> dict[tuple[str, int], dict[str, Any]]:
+    trials = map(json.loads, lines.read_text(encoding="utf-8").splitlines())
+    return {(trial["case"], trial["seed"]): trial for trial in trials}
+
+
+def _tell(trial: dict[str, Any], lines: Path | None) -> None:
+    if lines is not None:
+        with lines.open("a", encoding="utf-8") as file:
             file.write(json.dumps(trial) + "\n")
     if trial["caught"] == (trial["case"] == "none") and (trial["wrong"] or trial["case"] == "none"):
         print(json.dumps(trial), file=sys.stderr, flush=True)

@@ -25,7 +25,7 @@ SCENES = (
 )  # fmt: skip
 OFF = 0.02
 """Relative depth error at the median of a map beyond which it is wrong."""
-WORSE = 1.3
+WORSE = 2.0
 """Least ratio of a wrong map's error to that of the undisturbed one: in fog, few photons alone can be off by 2 %."""
 FEWEST_PIXELS = 50
 """Fewest pixels with depth and truth for a map's depth to be judged."""
