@@ -173,9 +173,10 @@ def load_surfaces(scene: SceneFile, folder: Path, u: Array, v: Array) -> Surface
 
         return board_scene(u, v, load_boards(scene.boards, folder), scene.wall)
     path = folder / os.path.expanduser(scene.surfaces)
-    if not path.is_dir():
+    if not os.path.isdir(path):  # unlike Path.is_dir, it accepts any text as a name
         raise DeviceError(
-            f"surfaces {scene.surfaces!r}: {str(path)!r} is no folder; name 'street', 'board' or a folder with a scene in it"
+            f"surfaces {scene.surfaces!r}: {str(path)!r} is no folder; name 'street', 'board' or a folder with a scene "
+            "in it"
         )
     return load_folder(path, (u.shape[0], u.shape[1]))
 

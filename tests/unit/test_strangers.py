@@ -15,6 +15,7 @@ import yaml
 
 from calibration.board.board import load_board
 from calibration.errors import CalibrationError
+from calibration.files.npy_files import load_arrays
 from drivers.errors import CommandRefused, DeviceError, ProtocolError
 from drivers.replay.spad import recorded_info
 from rig.api import cut, import_frames
@@ -26,6 +27,7 @@ from rig.recording.open import info, open_recording
 from rig.recording.repair import repair
 from rig.recording.verify import Integrity, verify
 from rig.requests import RunsRequest
+from rig.run_folder.folder import read_learned
 from rig.run_folder.manifest import MANIFEST, file_crc32, read_manifest, sealed_text
 from rig.run_folder.map_files import map_numbers, read_arrays, read_depth
 from rig.run_folder.pictures import png_bytes, read_grey
@@ -36,6 +38,7 @@ from rig.view.access import Access, Asked
 from rig.view.pages import PageWish
 from sim_backend.scenes.scene import SceneFile, load_scene, load_surfaces
 from tests.campaigns.inputs import wires
+from tests.campaigns.inputs.recordings import learned_seeds
 from tests.unit.rig.count.streams import plan_of, rig_model, scan
 from tests.unit.rig.recording.recorded import record, run_blocks
 
@@ -282,7 +285,7 @@ def test_strings_of_a_usb_device_command_no_terminal() -> None:
     target.parse(wires.pack([text.encode("utf-16-le") for text in ("\x1b[2J", "SPB1\n\u2028")]))
 
 
-@pytest.mark.parametrize("name", ["~no-such-user/scene.yaml", "a\0b"])
+@pytest.mark.parametrize("name", ["~no-such-user/scene.yaml", "a\0b", "a" * 300])
 def test_a_path_that_leads_nowhere_is_a_mistake_like_any_other(tmp_path: Path, name: str) -> None:
     with pytest.raises(DeviceError, match="is no file, no folder and none of the bundled"):
         load_scene(name)
@@ -294,3 +297,25 @@ def test_a_path_that_leads_nowhere_is_a_mistake_like_any_other(tmp_path: Path, n
     study = tmp_path / "study.yaml"
     study.write_text(yaml.safe_dump({"do": "scan", "vary": {"scene": [name]}}))
     assert load_study(study).vary == {"scene": [name]}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"row_gain": np.ones(4)},
+        {"ambient": np.zeros((4, 64), "<U4")},
+        {"column_gain": np.ones((20, 1), np.float32)},
+        {"before": np.zeros((1, 4, 20), np.uint16)},
+        {"line_sigma_px": np.float64(1e9)},
+        {"line_sigma_px": np.float64(np.nan)},
+        {"per_w": np.float64(0)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_learned_state_has_the_form_that_kernels_read(tmp_path: Path, change: dict[str, Any]) -> None:
+    (tmp_path / "learned.npz").write_bytes(learned_seeds()[0])
+    arrays = load_arrays(tmp_path / "learned.npz")
+    assert read_learned(tmp_path / "learned.npz").line_sigma_px == 0.5
+    np.savez(tmp_path / "learned.npz", **{**arrays, **change})
+    with pytest.raises(UsageError, match=f"holds nothing that joint has learned \\({next(iter(change))} is "):
+        read_learned(tmp_path / "learned.npz")

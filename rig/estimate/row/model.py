@@ -42,6 +42,17 @@ _SHAPES = {
 }
 
 
+_FORMS = {
+    **dict.fromkeys(("profile", "ambient", "halo"), ("float32", 2)),
+    **dict.fromkeys(("row_gain", "column_gain", "amplitude"), ("float32", 1)),
+    "weight": ("float64", 1),
+    "before": ("uint16", 3),
+}
+"""Types and dimensions of the arrays; other fields are numbers. Kernels check neither."""
+_LIMITS = {"w_lo": (0.0, 1e3), "per_w": (1e-6, 1e12), "none_weight": (0.0, 1.0), "line_sigma_px": (0.05, 20.0)}
+"""Bounds of numbers by which tables are made, far beyond those of any state."""
+
+
 @dataclass(frozen=True, slots=True)
 class RowModel:
     """Learned state of the row likelihood, enough to estimate a map again bit for bit.
@@ -80,7 +91,7 @@ class RowModel:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> "RowModel":
         """The state from which `arrays` came, bit for bit. Raises KeyError if a field without a default is missing,
-        ValueError if a field in _SHAPES has another shape."""
+        ValueError if a field has another type or shape than any state, or a number that none has."""
         kept = {
             field.name: arrays[field.name]
             for field in fields(cls)
@@ -89,7 +100,16 @@ class RowModel:
         for name, shape in _SHAPES.items():
             if name in kept and kept[name].shape != shape:
                 raise ValueError(f"{name} is of {kept[name].shape} numbers, not {shape}")
+        for name, value in kept.items():
+            number = value.dtype.kind == "f" and value.ndim == 0
+            if (value.dtype.name, value.ndim) != _FORMS[name] if name in _FORMS else not number:
+                raise ValueError(f"{name} is {value.dtype} of {value.ndim} dimensions")
+        if "before" in kept and len(kept["before"]) != 2:
+            raise ValueError(f"before is of {len(kept['before'])} parts, not 2")
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
+        for name, (low, high) in _LIMITS.items():
+            if not low <= values[name] <= high:
+                raise ValueError(f"{name} is {values[name]:g}, outside {low:g} to {high:g}")
         return cls(**values)
 
     def hot_flux(self) -> float:

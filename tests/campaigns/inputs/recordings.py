@@ -288,7 +288,8 @@ def _plan(data: bytes) -> None:
     read_plan(folder)
 
 
-def _learned_seeds() -> list[bytes]:
+def learned_seeds() -> list[bytes]:
+    """A learned state, plain and compressed."""
     from rig.estimate.row.model import _SHAPES
 
     arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in _SHAPES.items()}
@@ -297,6 +298,7 @@ def _learned_seeds() -> list[bytes]:
     arrays |= dict.fromkeys(
         ("w_lo", "per_w", "none_weight", "line_sigma_px", "extinction_per_m", "extinction_sd_per_m"), np.float64(0.5)
     )
+    arrays["weight"] = arrays["weight"].astype(np.float64)
     return [npz(**arrays), npz(packed=True, **arrays)]
 
 
@@ -330,7 +332,7 @@ TARGETS = (
     Target("summary", lambda: [json.dumps(SUMMARY_CONTENT).encode()], _summary, changes=Changes(tree=JSON)),
     Target("plan", _files(PLAN_FILE), _plan, changes=Changes(tree=YAML, most_bytes=200_000)),
     Target(
-        "learned", _learned_seeds, in_file(LEARNED_FILE, read_learned), changes=Changes(tree=NPZ, most_bytes=100_000)
+        "learned", learned_seeds, in_file(LEARNED_FILE, read_learned), changes=Changes(tree=NPZ, most_bytes=100_000)
     ),
     Target("control-traffic", _taps, in_file(CONTROL_FILE, read_taps), changes=Changes(tree=JSON)),
 )
