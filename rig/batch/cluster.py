@@ -162,6 +162,7 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
         distributed = import_module("distributed")
     except ImportError as error:
         raise UsageError(f"`cluster` needs the package distributed; {install_command('distributed')}") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells of every worker that comes and goes
     if "://" in cluster:
         try:
             _require_answer(cluster)
