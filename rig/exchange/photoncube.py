@@ -119,7 +119,7 @@ def _width(file: Path, frames: NDArray[np.uint8], beside: Mapping[str, Any]) -> 
     else:
         return packed
     if not isinstance(width, int) or not packed - 8 < width <= packed:
-        raise UsageError(f"{file} has rows of {frames.shape[2]} bytes, the file beside it says a width of {width}")
+        raise UsageError(f"{file} has rows of {frames.shape[2]} bytes, the file beside it says a width of {width!r}")
     return width
 
 

@@ -319,3 +319,15 @@ def test_a_learned_state_has_the_form_that_kernels_read(tmp_path: Path, change: 
     np.savez(tmp_path / "learned.npz", **{**arrays, **change})
     with pytest.raises(UsageError, match=f"holds nothing that joint has learned \\({next(iter(change))} is "):
         read_learned(tmp_path / "learned.npz")
+
+
+def test_words_beside_a_photon_cube_command_no_terminal(tmp_path: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.full((3, 2, 2), 7, np.uint8))
+    for beside in (
+        {"format": "spadrig-frames", "width": "\r\x1b[2J"},
+        {"file_path": "cube.npy", "bitpack": True, "bitpack_dim": "\x1b[2J"},
+    ):
+        (tmp_path / "transforms.json").write_text(json.dumps(beside))
+        with pytest.raises(UsageError) as refused:
+            import_frames("photoncube", [tmp_path / "cube.npy"], tmp_path / "import")
+        assert str(refused.value).isprintable()

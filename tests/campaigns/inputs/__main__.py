@@ -20,7 +20,7 @@ from pathlib import Path
 def main() -> int:
     """1 where an input ended wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parser", help="name of a parser, or 'all'")
+    parser.add_argument("parsers", nargs="+", metavar="PARSER", help="names of parsers, or 'all'")
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, default=math.inf, help="most processor time for a parser")
     parser.add_argument("--seed", type=int, default=1)
@@ -37,7 +37,7 @@ def main() -> int:
         from tests.campaigns.inputs.targets import TARGETS
     from tests.campaigns.inputs.fuzz import Found, fuzz, fuzz_guided
 
-    names = list(TARGETS) if asked.parser == "all" else [asked.parser]
+    names = list(TARGETS) if "all" in asked.parsers else asked.parsers
     if unknown := [name for name in names if name not in TARGETS]:
         parser.error(f"no parser {unknown[0]!r}; choose all or one of {', '.join(TARGETS)}")
     wrong = 0
