@@ -36,6 +36,14 @@ DELAY_S = 0.3
 TOLD_S = 15.0
 STEP = 20
 """Dask workers that are started at a time."""
+QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "60s",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.low-level-log-length": 10,
+}
+"""Settings of dask. 200 workers in one process would be busy with watching themselves, each 100 times a second, and
+each would keep its last 1000 messages, some 2 MB."""
 
 
 def busy(x: int, cpu_s: float) -> dict[str, Any]:
@@ -119,12 +127,14 @@ def overhead(rounds: int) -> None:
 
 def scheduler(workers: int, count: int, longest_s: float) -> None:
     """Print the rate of cases and the memory over time."""
+    import dask
     from distributed import Client, LocalCluster
 
+    dask.config.set(QUIET)
     logging.getLogger("distributed").setLevel(logging.ERROR)
     cluster._on_worker = on_light_worker
     cases = [Case("tests.benchmarks.batch:idle", {"x": x}) for x in range(count)]
-    alone: dict[str, Any] = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0"}
+    alone: dict[str, Any] = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0", "memory_limit": 0}
     with (
         tempfile.TemporaryDirectory() as place,
         LocalCluster(n_workers=0, **alone) as found,  # type: ignore[no-untyped-call]
