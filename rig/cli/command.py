@@ -250,7 +250,7 @@ _STEPS = {
 }
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-"""What the system says of a disk without room."""
+"""The system's codes for a disk without room."""
 
 
 def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: object) -> int:

@@ -63,7 +63,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
 
 
 class _TradeoffFile(BaseModel):
-    """What a page needs of the file."""
+    """Parts of the file that a page needs."""
 
     rows: Annotated[list[TradeoffRow], Field(min_length=1)]
     verdict: str

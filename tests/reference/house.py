@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 LIMITS: Mapping[str, tuple[str, int]] = {
-    "modules": ("at most", 480),
+    "modules": ("at most", 500),
     "lines": ("at most", 60_000),
     "median": ("at least", 130),
     "folder": ("at most", 12),

@@ -46,6 +46,6 @@ def test_all_files_of_maps_are_the_same_and_so_are_the_figures(recording, whole,
 
 def test_what_needs_the_map_before_is_refused_with_the_reason(recording, tmp_path):
     request = api.ReconstructRequest(out=tmp_path / "parts", estimator="likelihood")
-    with pytest.raises(UsageError, match="likelihood learns .*, and the scan has kept the states of joint"):
+    with pytest.raises(UsageError, match=r"likelihood learns .*, and the scan has kept the states of joint"):
         api.reconstruct_parts(recording, request=request)
     assert not list(tmp_path.iterdir())

@@ -53,9 +53,11 @@ class BatchResult:
 
 @dataclass(frozen=True, slots=True)
 class BatchPlan:
-    """The work that a study would be. cases, left: of the study, and of those that have no result yet; workers: at once, on this
-    computer; case_s: mean wall time of a case in seconds, tried with a few, with one thread; wall_s: of all that are
-    left."""
+    """The work that a study would be.
+
+    cases, left: number of all cases, and of those without a result. workers: cases at once, on this computer. case_s:
+    mean wall time of a case in seconds, with one thread, found by trying a few. wall_s: of all that are left.
+    """
 
     cases: int
     left: int
