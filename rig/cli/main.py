@@ -5,16 +5,20 @@ done, 1 result not trustworthy, 2 bad usage or config, 3 device error, 4 aborted
 Nothing heavy is imported before a command runs.
 """
 
+import _thread
+import errno
+import io
 import logging
 import os
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,6 +39,7 @@ _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 """Signals that end a program, besides Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
 """Exit code that typer returns after an interrupt."""
+_AGAIN_S = 0.01
 
 app = typer.Typer(
     name="rig",
@@ -58,6 +63,8 @@ for _commands in (
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `rig`; ends the process with the exit code."""
+    if argv is None:
+        _go_on_unread()
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname)s: %(message)s")
     # Matrices are small here: with numpy's own threads some steps take up to 30 times as long on two cores.
@@ -73,6 +80,29 @@ def main(argv: Sequence[str] | None = None) -> None:
         if code == _TYPER_INTERRUPTED:  # an interrupt before a command had begun, or a second one while it ended
             code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+class _Output(io.FileIO):
+    """An output of the program. What is written after its reader has gone, as behind `| head -1` or on a terminal whose
+    window was closed, is dropped: the work goes on, and its exit code stays what it means."""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
+            return memoryview(data).nbytes
+
+
+def _go_on_unread() -> None:
+    """Let both outputs outlive their readers."""
+    for name in ("stdout", "stderr"):
+        before = getattr(sys, name)
+        if isinstance(before, io.TextIOWrapper):
+            before.flush()
+            output = io.BufferedWriter(_Output(before.fileno(), "w", closefd=False))
+            setattr(sys, name, io.TextIOWrapper(output, before.encoding, before.errors, None, before.line_buffering))
 
 
 def _ignore_interrupts() -> None:
@@ -99,12 +129,27 @@ def _signals_interrupt() -> Iterator[None]:
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 before[number] = signal.signal(number, interrupt)
+    hook, sys.unraisablehook = sys.unraisablehook, partial(_interrupt_again, sys.unraisablehook)
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         for number, handler in before.items():
             if signal.getsignal(number) is interrupt:
                 signal.signal(number, handler)
+
+
+def _interrupt_again(usual: Callable[["sys.UnraisableHookArgs"], object], lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupt once more, a moment later, where Python had to drop the first interrupt: it came while an object was
+    being removed, from where nothing can be raised. usual: is told of everything else."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        usual(lost)
+        return
+    heard = next((each for each in (signal.SIGINT, signal.SIGTERM) if callable(signal.getsignal(each))), None)
+    if heard is not None:
+        again = threading.Timer(_AGAIN_S, _thread.interrupt_main, (heard,))
+        again.daemon = True
+        again.start()
 
 
 def _say_why(error: BaseException, arguments: list[str]) -> int:

@@ -150,6 +150,39 @@ def test_further_signals_change_nothing_of_how_a_command_has_ended(then: str, en
     assert (ran.returncode, ran.stderr) == ended
 
 
+@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
+def test_a_reader_that_goes_away_changes_nothing_of_how_a_command_ends(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        command = [sys.executable, "-m", "spadrig", "runs", str(tmp_path)]
+        ran = subprocess.run(command, stdout=write, stderr=write, timeout=60, check=False)
+        failed = subprocess.run([*command, "--since", "never"], stdout=write, stderr=write, timeout=60, check=False)
+    finally:
+        os.close(write)
+    assert (ran.returncode, failed.returncode) == (0, 2)
+
+
+def test_an_interrupt_that_python_drops_comes_again() -> None:
+    program = (
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from rig import api\n"
+        "from rig.cli.main import main\n"
+        "class Interrupts:\n"
+        "    def __del__(self): raise KeyboardInterrupt\n"
+        "def found(*given, **options):\n"
+        "    Interrupts()\n"
+        "    ends_at = time.monotonic() + 20\n"
+        "    while time.monotonic() < ends_at: pass\n"
+        "    return []\n"
+        "api.runs = found\n"
+        "main()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program, "runs", "--json"], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stderr) == (4, "aborted\n")
+
+
 def test_an_interrupt_before_a_command_has_begun_is_one_too(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
