@@ -137,14 +137,14 @@ def _wrong_recording(run: Path, usual: Path, prefix: bool) -> Iterator[str]:
     if code != 0:
         yield f"rig info ends with {code}: {out[:200]}"
     if prefix and usual.exists() and (frames := frames_of(run)) is not None:
-        all_frames = frames_of(usual)
+        all_frames = frames_of(usual, run.parent.parent / f"usual-{run.name}")
         if all_frames is None or not np.array_equal(frames, all_frames[: len(frames)]):
             yield f"its {len(frames)} frames are not the first of those of a run that nothing ended"
 
 
-def frames_of(run: Path) -> "np.ndarray[Any, Any] | None":
-    """The frames of a recording, as `rig export` gives them."""
-    to = run.parent.parent / f"exported-{run.name}"
+def frames_of(run: Path, to: Path | None = None) -> "np.ndarray[Any, Any] | None":
+    """The frames of a recording, as `rig export` gives them in the folder `to`."""
+    to = to or run.parent.parent / f"exported-{run.name}"
     if not (to / "frames.npy").exists():
         code, _ = asked("export", run, "npy", "--out", to)
         if code != 0:

@@ -4,6 +4,7 @@ import fcntl
 import os
 import pty
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -20,6 +21,7 @@ RIG = Path(sys.executable).with_name("rig")
 TOKEN = "SPADRIG_ENDS_TRIAL"
 """Variable of the environment by which the processes of a trial are known, whatever became of their parents."""
 _POLL_S = 0.004
+_LOOK_S = 0.05
 _PROGRESS = re.compile(r"^\d+:\d\d ")
 _SEQUENCES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -65,7 +67,8 @@ class Running:
                 preexec_fn=_own_terminal,
             )  # fmt: skip
             os.close(slave)
-            threading.Thread(target=self._read_terminal, args=(self._master,), daemon=True).start()
+            self._reader = threading.Thread(target=self._read_terminal, args=(self._master,), daemon=True)
+            self._reader.start()
         else:
             with self._out.open("wb") as out, self._err.open("wb") as err:
                 to: dict[str | None, tuple[Any, Any]] = {
@@ -112,9 +115,10 @@ class Running:
             self._process.send_signal(number)
 
     def close_terminal(self) -> None:
-        """Close the window of its terminal."""
+        """Close the window of its terminal. The thread that reads must let go of it first."""
         if self._master is not None:
             master, self._master = self._master, None
+            self._reader.join()
             os.close(master)
 
     def sleep(self, seconds: float) -> None:
@@ -150,7 +154,9 @@ class Running:
                 return
 
     def _read_terminal(self, master: int) -> None:
-        while True:
+        while self._master is not None:
+            if not select.select([master], [], [], _LOOK_S)[0]:
+                continue
             try:
                 read = os.read(master, 65536)
             except OSError:  # the last program on the terminal has ended, or its window is closed

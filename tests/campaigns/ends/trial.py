@@ -90,10 +90,10 @@ class _Trial:
 
     def run(self) -> Iterator[str]:
         """Do the trial and yield all that is wrong."""
-        lay(self._command, self._material, self._work)
         self._tmp.mkdir()
         if self._end in (FULL, "unmounted"):
             self._mount()
+        lay(self._command, self._material, self._work)
         before = {place: checksums(self._work / place) for place in ("in", "runs")}
         changed_before = {name: frames_of(self._work / "out" / name) for name in self._command.changes}
         pipe = {"| head -1": "out", "2>&1 | head -1": "both"}.get(self._end)
@@ -259,11 +259,11 @@ class _Trial:
             stop.wait(0.5)
 
     def _mount(self) -> None:
+        (self._work / "out").mkdir(parents=True)
         subprocess.run(
             ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "none", self._work / "out"], check=True, timeout=60
         )
         self._mounted = True
-        lay(Command("", changes=self._command.changes), self._material, self._work)
 
     def _unmount(self) -> None:
         if self._mounted:
