@@ -5,16 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.depth import knocks
 from rig.depth.depth import DepthMap
 from rig.depth.fog_meter import FogEstimate
 from rig.depth.knocks import KNOCKED, KnockWatch
 from rig.depth.reconstruct import MapResult
 from rig.geometry.stripe_table import StripeTable
-from tests.stability.inventory import covers
 from tests.unit.small_maps import simulated
-
-covers(knocks)
 
 ROWS, COLUMNS = 64, 160
 SWEEP = simulated("report", 10, rows=ROWS, columns=COLUMNS)
