@@ -120,7 +120,13 @@ def _signals_interrupt() -> Iterator[None]:
     A signal that is ignored (nohup) stays ignored. Outside the main thread the context does nothing.
     """
 
+    heard = set[int]()
+
     def interrupt(number: int, frame: object) -> None:
+        # One closed terminal sends SIGHUP twice: to its session's leader, and to the group that is in front.
+        if number == getattr(signal, "SIGHUP", None) and number in heard:
+            return
+        heard.add(number)
         raise KeyboardInterrupt
 
     before = {}

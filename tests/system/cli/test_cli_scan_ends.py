@@ -163,6 +163,26 @@ def test_a_reader_that_goes_away_changes_nothing_of_how_a_command_ends(tmp_path:
     assert (ran.returncode, failed.returncode) == (0, 2)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_closed_terminal_which_sends_its_signal_twice_interrupts_once() -> None:
+    program = (
+        "import os, signal\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
+        "from rig import api\n"
+        "from rig.cli.main import main\n"
+        "def found(*given, **options):\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    finally:\n"
+        "        os.kill(os.getpid(), signal.SIGHUP)\n"
+        "        print('all is put away')\n"
+        "api.runs = found\n"
+        "main()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program, "runs"], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (4, "all is put away\n", "aborted\n")
+
+
 def test_an_interrupt_that_python_drops_comes_again() -> None:
     program = (
         "import signal, sys, time\n"
