@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 _NUMBER = re.compile(
     r"(?P<mantissa>[+-]?(?:\d+\.?\d*|\.\d+))(?:[eE](?P<exponent>[+-]?\d{1,3}))?(?:/(?P<divisor>\d+))?", re.ASCII
 )
-_FRACTION = re.compile(r"-?\d{1,1000}(/\d{1,1000})?", re.ASCII)
+_FRACTION = re.compile(r"-?\d{1,1000}(/[1-9]\d{0,999})?", re.ASCII)
 _MAX_TEXT = 1000
 """Longest text taken, in characters: exact arithmetic on an endless number would take endless time."""
 

@@ -17,8 +17,12 @@ from drivers.units import (
     Seconds,
     format_quantity,
     parse_exact,
+    parse_fraction,
     parse_quantity,
 )
+from tests.stability.inventory import covers
+
+covers(parse_fraction)
 
 DIMENSION = st.sampled_from(sorted(DIMENSIONS))
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -65,6 +69,17 @@ def test_an_exact_frequency_stays_exact() -> None:
     assert parse_exact("97.7 kHz", "frequency") == 97_700
     assert parse_exact("100000/3 Hz", "frequency") == Fraction(100_000, 3)
     assert parse_exact("0.1 Hz", "frequency") == Fraction(1, 10)
+
+
+@pytest.mark.parametrize("fraction", [Fraction(100_000, 3), Fraction(-7), Fraction(0), Fraction(1, 3**20)])
+def test_a_fraction_reads_back_from_its_text(fraction: Fraction) -> None:
+    assert parse_fraction(str(fraction)) == fraction
+
+
+@pytest.mark.parametrize("text", ["1e999999999", "1/0", "0.5", "nan", "", " 1", "1/3/4", 3, None, "9" * 5000])
+def test_what_str_makes_of_no_fraction_is_refused_in_one_line_at_once(text: object) -> None:
+    with pytest.raises(ValueError, match=r"\A[^\n]{1,200}\Z"):
+        parse_fraction(text)
 
 
 @settings(deadline=None)  # a busy machine is no failure

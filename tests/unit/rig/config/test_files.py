@@ -291,7 +291,7 @@ def test_every_extra_is_imported_somewhere() -> None:
     )
     for name, packages in extras.items():
         if name not in ("docs", "tests", "tracer"):
-            modules = [re.match(r"[\w-]+", package)[0] for package in packages]
+            modules = [re.match(r"[\w-]+", package)[0].replace("-", "_") for package in packages]
             assert all(re.search(rf"^\s*import {module}\b|\"{module}\"", code, re.MULTILINE) for module in modules), (
                 name
             )
