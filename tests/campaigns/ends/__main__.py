@@ -78,7 +78,7 @@ def tell(drawn: Sequence[tuple[str, str, int]], results: Sequence[dict[str, Any]
             by_end[end]["not done"] += 1
             continue
         by_end[end][found["outcome"]] += 1
-        longest[end] = max(longest[end], found["measured"].get("seconds", 0.0))
+        longest[end] = max(longest[end], found["measured"].get("ending_s", 0.0))
         if command == "light":
             print(f"{end}, seed {seed}: {found['outcome']}, {found['measured']}")
         if found["wrong"]:
