@@ -4,9 +4,9 @@ python -m tests.campaigns.batch_run SPEC.json: does the batch that the file desc
 JSON, and ends on SIGINT and SIGTERM as `rig batch` does.
 """
 
+import argparse
 import json
 import signal
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -66,7 +66,9 @@ def run(spec: Spec, seen: Callable[[Executor], object] = lambda executor: None) 
 def main() -> None:
     """Do the batch of a file."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    content: dict[str, Any] = json.loads(Path(sys.argv[1]).read_text())
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("spec", type=Path, metavar="SPEC.json")
+    content: dict[str, Any] = json.loads(parser.parse_args().spec.read_text())
     content |= {"bad": {int(x): kind for x, kind in content["bad"].items()}, "shard": tuple(content["shard"])}
     try:
         said = asdict(run(Spec(**content)))

@@ -12,35 +12,35 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.campaigns.wrong_inputs.inputs import CASES
-from tests.campaigns.wrong_inputs.trial import case
 from tests.reference.tables.printed import Table
 
 SEEDS_APART = 1_000_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the trials and print the table; 1 if an undisturbed map was doubted."""
+    """Run the trials and print the table; 1 if an undisturbed map was doubted, or a trial failed."""
     parser = argparse.ArgumentParser(description="wrong inputs that look right, against the verdict")
     parser.add_argument("--trials", type=int, default=20, help="of each case")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", default=list(CASES), choices=CASES, metavar="case")
-    parser.add_argument(
-        "--lines", type=Path, help="file of one line of JSON per trial; trials that it has are not repeated"
-    )
+    add_options(parser)
     asked = parser.parse_args(arguments)
-    done = {} if asked.lines is None or not asked.lines.exists() else _told(asked.lines)
+    seeds = range(asked.seed * SEEDS_APART, asked.seed * SEEDS_APART + asked.trials)
+    wanted = [{"name": name, "seed": seed} for name in asked.only for seed in seeds]
+    cases = [Case("tests.campaigns.wrong_inputs.trial:case", each, each) for each in wanted]
+    found = [trial for trial in results_of(cases, asked.workers, asked.out) if trial is not None]
+    for trial in found:
+        if trial["caught"] == (trial["case"] == "none") and (trial["wrong"] or trial["case"] == "none"):
+            print(json.dumps(trial))
     table = Table(("case", "trials", "no depth, or error", "off by > 2 %", "of these caught", "caught in all", "by"))
     doubted = 0
     for name in asked.only:
-        trials = []
-        for seed in range(asked.seed * SEEDS_APART, asked.seed * SEEDS_APART + asked.trials):
-            trials.append(done.get((name, seed)) or case(name, seed))
-            if (name, seed) not in done:
-                _tell(trials[-1], asked.lines)
+        trials = [trial for trial in found if trial["case"] == name]
         wrong = [trial for trial in trials if trial["wrong"]]
         by = Counter(_short(trial) for trial in trials if trial["caught"])
         table.add(
@@ -56,26 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         doubted += sum(bool(trial["caught"] if name == "none" else trial["undisturbed_doubted"]) for trial in trials)
     print(f"undisturbed maps that were doubted: {doubted}")
-    return 1 if doubted else 0
+    return 1 if doubted or len(found) < len(cases) else 0
 
 
 def _short(trial: dict[str, Any]) -> str:
     """What a trial was caught by, in few words."""
     reason = trial["reasons"][0].split(":")[0] if trial["reasons"] else ""
     return trial["verdict"] if trial["verdict"] != "doubtful" else reason[:48]
-
-
-def _told(lines: Path) -> dict[tuple[str, int], dict[str, Any]]:
-    trials = map(json.loads, lines.read_text(encoding="utf-8").splitlines())
-    return {(trial["case"], trial["seed"]): trial for trial in trials}
-
-
-def _tell(trial: dict[str, Any], lines: Path | None) -> None:
-    if lines is not None:
-        with lines.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(trial) + "\n")
-    if trial["caught"] == (trial["case"] == "none") and (trial["wrong"] or trial["case"] == "none"):
-        print(json.dumps(trial), file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """One trial: a setting by chance, an input with one thing wrong, and what the program makes of it."""
 
-import logging
 import tempfile
 import zlib
 from pathlib import Path
@@ -23,7 +22,6 @@ def case(name: str, seed: int) -> dict[str, Any]:
     OFF, and more than WORSE times that. verdict: of the run, or 'error'. reasons: of the verdict, or the error's lines.
     caught: whether verdict or error say that something is wrong.
     """
-    logging.getLogger().setLevel(logging.CRITICAL)  # what is wrong is worth warnings, and is to be in the verdict
     wanted = CASES[name]
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     with tempfile.TemporaryDirectory(prefix="wrong-") as folder:
