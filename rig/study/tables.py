@@ -4,8 +4,6 @@ A line for each case, or for each of the rows that a case returns; a column for 
 of the result. The figure shows the numbers over the setting with the most values that are numbers.
 """
 
-import csv
-import io
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -58,16 +56,6 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
             yield f"{before}{key}", "; ".join(map(str, value))
         else:
             yield f"{before}{key}", value
-
-
-def csv_text(lines: Sequence[Line]) -> str:
-    """The table as CSV."""
-    columns = list(dict.fromkeys(key for line in lines for key in line))
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return stream.getvalue()
 
 
 def study_report(folder: Path) -> str:

@@ -3,8 +3,6 @@
 The picture shows error over sensor time and over compute time, a pair of panels for each scene and fog.
 """
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,6 +17,7 @@ from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.errors import UsageError
 from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
+from rig.report.csv_file import csv_of
 from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
@@ -55,11 +54,7 @@ def csv_text(rows: Sequence[TradeoffRow]) -> str:
     lines = [asdict(row) for row in rows]
     for line in lines:
         line["ci95_low"], line["ci95_high"] = line.pop("ci95")
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, lines[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return stream.getvalue()
+    return csv_of(lines)
 
 
 class _TradeoffFile(BaseModel):

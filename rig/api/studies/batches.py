@@ -15,16 +15,17 @@ from rig.api import strategies, tradeoffs
 from rig.batch.case import Case, Result
 from rig.batch.engine import Batch, Executor, probe, run_batch
 from rig.batch.pool import Limits, Pool, usual_workers
-from rig.batch.store import Row, Store
+from rig.batch.store import Row, Store, read_rows
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
 from rig.progress import Progress
+from rig.report.csv_file import csv_of
 from rig.requests import BatchRequest, StrategiesRequest, TradeoffRequest
 from rig.run_folder.disk import replace_file
 from rig.run_folder.folder import RunFolder
 from rig.study.cases import cases_of, kept_cases
 from rig.study.definition import Study, load_study
-from rig.study.tables import csv_text, lines_of, study_report
+from rig.study.tables import lines_of, study_report
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -42,8 +43,6 @@ class BatchResult:
 
     def rows(self) -> list[Row]:
         """The finished cases, in order."""
-        from rig.batch.store import read_rows
-
         return list(read_rows(self.folder))
 
     def as_json(self) -> dict[str, Any]:
@@ -197,7 +196,7 @@ def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
     rows = list(store.rows())
     if not rows:
         return
-    replace_file(store.folder / "table.csv", csv_text(lines_of(rows)[0]).encode())
+    replace_file(store.folder / "table.csv", csv_of(lines_of(rows)[0]).encode())
     replace_file(store.folder / "report.html", study_report(store.folder).encode())
     if made.write is not None:
         results = {row.case: {**row.result, "measured": row.measured} for row in rows}

@@ -5,8 +5,6 @@ show the best strategy of each kind. Strategies are of one kind if the first wor
 or conventional camera) are the same.
 """
 
-import csv
-import io
 import math
 import statistics
 from collections.abc import Callable, Sequence
@@ -15,6 +13,7 @@ from typing import Final
 
 from rig.geometry.stripe_table import MISSING_PX
 from rig.report.charts import Panel, Series, chart_svg
+from rig.report.csv_file import csv_of
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
@@ -42,11 +41,7 @@ def write_files(folder: RunFolder, done: Comparison) -> Comparison:
 
 def csv_text(rows: Sequence[StrategyRow]) -> str:
     """The rows as CSV, one line each, with the columns of the JSON file. rows: at least one."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, asdict(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return stream.getvalue()
+    return csv_of([asdict(row) for row in rows])
 
 
 def kind_of(strategy: str) -> str:

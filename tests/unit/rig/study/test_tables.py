@@ -12,8 +12,9 @@ import pytest
 from rig.batch.engine import run_batch
 from rig.batch.store import Row, Store, read_rows
 from rig.errors import UsageError
+from rig.report.csv_file import csv_of
 from rig.study import tables as module
-from rig.study.tables import csv_text, lines_of, panels_of, study_report
+from rig.study.tables import lines_of, panels_of, study_report
 from tests.unit.rig.batch.executors import Inline, squares, troubles
 
 
@@ -39,7 +40,7 @@ def test_a_case_of_several_rows_has_a_line_for_each_with_its_own_times() -> None
 
 
 def test_the_csv_has_all_columns_of_all_lines() -> None:
-    text = csv_text([{"a": 1, "b": "x, y"}, {"a": 2, "c": None}])
+    text = csv_of([{"a": 1, "b": "x, y"}, {"a": 2, "c": None}])
     assert list(csv.DictReader(io.StringIO(text))) == [
         {"a": "1", "b": "x, y", "c": ""}, {"a": "2", "b": "", "c": ""},
     ]  # fmt: skip
@@ -107,5 +108,5 @@ def test_the_order_of_results_does_not_change_the_page_or_the_csv(tmp_path: Path
             {key: value for key, value in line.items() if key in ("x", "y")}
             for line in lines_of([*read_rows(folder)])[0]
         ]
-        texts.add(json.dumps(lines) + csv_text(lines))
+        texts.add(json.dumps(lines) + csv_of(lines))
     assert len(texts) == 1

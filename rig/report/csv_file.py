@@ -1,0 +1,16 @@
+"""Lines of a table as CSV text."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def csv_of(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The text, with a column for every key that a line has, in the order in which they first come."""
+    columns = list(dict.fromkeys(key for line in lines for key in line))
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return stream.getvalue()
