@@ -50,6 +50,9 @@ def reconstruct_parts(
     """Make the depth maps of a recording by parts (`rig reconstruct --cluster`). The maps are those of `reconstruct`,
     bit for bit, and are in the request's `out`; the result holds none of them.
 
+    A map is not compared with the last one of the part before it, so that a knock of the rig between these two is not
+    doubted, as it would be in one go (`rig.depth.knocks`).
+
     An estimator that learns needs the states that the recording's own scan has kept for each map. So it must be the
     estimator of the scan, with the same calibration. An interrupted reconstruction goes on where it stopped: what is
     done is beside `out`, in a folder with `.parts` added to its name.
