@@ -117,7 +117,8 @@ def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
             for number, (label, points) in enumerate(list(curves.items())[:MOST_CURVES])
         ]
         positive = all(y > 0 for each in series for _, y in each.points)
-        panels.append(Panel(key, over, key, series, x_log=min(_numbers(lines, over)) > 0, y_log=positive))
+        title = key if len(curves) <= MOST_CURVES else f"{key} (first {MOST_CURVES} of {len(curves)} curves)"
+        panels.append(Panel(title, over, key, series, x_log=min(_numbers(lines, over)) > 0, y_log=positive))
     return panels
 
 
