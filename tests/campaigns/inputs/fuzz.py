@@ -13,7 +13,6 @@ import math
 import os
 import random
 import re
-import resource
 import signal
 import sys
 import time
@@ -39,6 +38,8 @@ OURS = (RigError, CalibrationError, DeviceError)
 """Errors of the program, which its command line shows as lines."""
 _ATHERIS_SHARE = 0.3
 """Share of the changes that atheris makes itself, without regard to the form of an input."""
+_FORGOTTEN_BYTES = 16 << 20
+"""An input that takes more must not hide what later ones take."""
 _MOST_KEPT = 2000
 """Inputs that are kept because they ended as no other."""
 
@@ -102,7 +103,7 @@ def strict() -> Iterator[None]:
 def ending(target: Target, data: bytes) -> tuple[str, str, str | None]:
     """How an input ends, within `strict`: the class of the error or 'taken', the same with the form of its message,
     and what is wrong."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = _peak_bytes()
     signal.setitimer(signal.ITIMER_PROF, MOST_S)
     name, text, wrong = "taken", "", None
     try:
@@ -119,10 +120,21 @@ def ending(target: Target, data: bytes) -> tuple[str, str, str | None]:
         wrong = f"{type(error).__name__}: {str(error)[:200]} ({_place(error.__traceback__)})"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
-    grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    grown = _peak_bytes() - before
+    if grown > _FORGOTTEN_BYTES:
+        Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak begins anew
     if wrong is None and grown > MOST_BYTES + MOST_RATIO * len(data):
         name, wrong = "large", f"took {grown >> 20} MiB for {len(data)} bytes"
     return name, f"{name} {_form(text)}", wrong
+
+
+def _peak_bytes() -> int:
+    """The most memory that this process has had, or has had since its peak was last begun anew.
+
+    Not `ru_maxrss`: a process that is started by another begins with the other's peak.
+    """
+    status = Path("/proc/self/status").read_text("ascii")
+    return 1024 * int(status.partition("VmHWM:")[2].split(None, 1)[0])
 
 
 def _unfit(error: Exception, text: str) -> str | None:

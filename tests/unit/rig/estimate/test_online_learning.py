@@ -1,5 +1,7 @@
 """When a map teaches, and from which map on that is heeded."""
 
+import gc
+import threading
 from collections import deque
 from dataclasses import replace
 from functools import partial
@@ -44,7 +46,12 @@ def taught(monkeypatch):
 
     monkeypatch.setattr(lessons, "learn_next", learn_next)
     monkeypatch.setattr(lessons, "ambient_map", lambda tally, *rest: MODEL.ambient)
-    return found
+    yield found
+    # A lesson that nobody waited for would be noted by the next test. Its thread ends when the learner is gone.
+    gc.collect()
+    for thread in threading.enumerate():
+        if thread.name.startswith("learning"):
+            thread.join(10)
 
 
 def run(frames, maps, learns=True, model=MODEL):
