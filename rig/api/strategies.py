@@ -7,6 +7,7 @@ from typing import Any, Final, cast
 from drivers.units import parse_quantity
 from rig.api.tradeoffs import WriteResults
 from rig.batch.case import Case, Result
+from rig.config.bundled import short_names
 from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.errors import UsageError, each_or_problems, noted
@@ -103,7 +104,7 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
         raise UsageError.of(problems)
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
-    scenes = _once(request.scenes) or SCENES
+    scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
     own = tuple(None if air == OWN else air for air in airs)
     asked = ComparisonPlan(scenes, own, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
     return loaded, ways, asked

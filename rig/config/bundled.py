@@ -4,6 +4,7 @@ This module imports little, since shells ask for the names at every Tab.
 """
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,13 @@ def bundled_rigs() -> tuple[Bundled, ...]:
 def bundled_scenes() -> tuple[Bundled, ...]:
     """The scenes that simulated rigs take by name as `scene`, sorted by name."""
     return tuple(_bundled(path) for path in _by_name(SCENES))
+
+
+def short_names(scenes: Iterable[str]) -> dict[str, str]:
+    """What to call scenes in tables: the last part of each path, or all of it if another one ends in the same part."""
+    last = {scene: scene.rstrip("/").rsplit("/", 1)[-1] for scene in scenes}
+    names = list(last.values())
+    return {scene: name if names.count(name) == 1 else scene for scene, name in last.items()}
 
 
 def _by_name(folder: Path) -> list[Path]:

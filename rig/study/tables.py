@@ -11,6 +11,7 @@ from typing import Any, Final, TypeGuard
 
 from calibration.errors import digits
 from rig.batch.store import LIST, Row, read_failures, read_rows
+from rig.config.bundled import short_names
 from rig.errors import UsageError
 from rig.report.charts import Panel, Series, legend, panel_svg
 from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
@@ -26,6 +27,8 @@ COLOURS: Final = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9
 FIRST: Final = "depth_error_m", "stripe_error_px", "mean_abs_px", "mean_px", "valid_fraction"
 """Figures that are shown before others."""
 SEED: Final = "seed"
+_UNITS: Final = {"per_m": "1/m", "px": "px", "m": "m", "mm": "mm", "s": "s", "ms": "ms", "mj": "mJ", "deg": "degrees"}
+"""Units by the end of a figure's name."""
 
 
 def lines_of(rows: Sequence[Row]) -> tuple[list[Line], list[str]]:
@@ -65,6 +68,7 @@ def study_report(folder: Path) -> str:
     if not rows:
         raise UsageError(f"{folder} has no finished case yet; run `rig batch` first")
     lines, labels = lines_of(rows)
+    lines = _with_short_names(lines)
     panels = panels_of(lines, labels)
     with (folder / LIST).open(encoding="utf-8") as stream:
         total = sum(1 for _ in stream)
@@ -80,7 +84,7 @@ def study_report(folder: Path) -> str:
         [verdict_box("complete" if whole else "part", said, [_said(each) for each in failures], good=whole)],
         [
             ("Figures", charts if panels else ""),
-            ("All cases", table(columns, cells) + (more if len(lines) > SHOWN_LINES else "")),
+            ("All cases", table(list(map(_in_words, columns)), cells) + (more if len(lines) > SHOWN_LINES else "")),
             ("Repeat failed cases", preformatted("\n".join(each["command"] for each in failures)) if failures else ""),
         ],
     )
@@ -108,7 +112,7 @@ def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
                 curves.setdefault(label, {}).setdefault(float(x), []).append(float(y))
         series = [
             Series(
-                label or key,
+                label or _in_words(key),
                 COLOURS[number % len(COLOURS)],
                 [(x, statistics.fmean(values)) for x, values in sorted(points.items())],
                 [(min(values), max(values)) for _, values in sorted(points.items())],
@@ -117,9 +121,31 @@ def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
             for number, (label, points) in enumerate(list(curves.items())[:MOST_CURVES])
         ]
         positive = all(y > 0 for each in series for _, y in each.points)
-        title = key if len(curves) <= MOST_CURVES else f"{key} (first {MOST_CURVES} of {len(curves)} curves)"
-        panels.append(Panel(title, over, key, series, x_log=min(_numbers(lines, over)) > 0, y_log=positive))
+        title = name = _in_words(key)
+        if len(curves) > MOST_CURVES:
+            title += f" (first {MOST_CURVES} of {len(curves)} curves)"
+        panels.append(Panel(title, _in_words(over), name, series, x_log=min(_numbers(lines, over)) > 0, y_log=positive))
     return panels
+
+
+def _with_short_names(lines: Sequence[Line]) -> list[Line]:
+    """The lines with the last part of each path instead of all of it, where that says which file it is."""
+    made = [dict(line) for line in lines]
+    for key in dict.fromkeys(key for line in lines for key in line):
+        values = {line[key] for line in lines if isinstance(line.get(key), str)}
+        names = short_names(sorted(values)) if any(Path(value).is_absolute() for value in values) else {}
+        for line in made:
+            if line.get(key) in names:
+                line[key] = names[line[key]]
+    return made
+
+
+def _in_words(key: str) -> str:
+    """A column of the table in words: 'depth_error_m.mean_abs' is 'depth error, mean abs (m)'."""
+    first, dot, rest = key.partition(".")
+    unit = next((end for end in _UNITS if first.endswith(f"_{end}")), "")
+    said = (first.removesuffix(f"_{unit}") + dot + rest).replace("_", " ").replace(".", ", ")
+    return f"{said} ({_UNITS[unit]})" if unit else said
 
 
 def _numbers(lines: Sequence[Line], key: str) -> set[float]:

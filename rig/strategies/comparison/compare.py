@@ -27,7 +27,7 @@ from rig.errors import RigError, UsageError
 from rig.plan.scan_plan import column_command
 from rig.progress import part, tell_stage
 from rig.simd import Float32, Float64
-from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule
+from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule, Spent
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
 from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
 from rig.strategies.comparison.score import Score, score, scored_pixels
@@ -57,11 +57,12 @@ PROTECTED: Final = "simulation for comparison only"
 class ComparisonPlan:
     """Scenes, air, times and rules of a comparison.
 
-    airs: fog, rain, snow or clear air; None for a scene's own. times_s: time of a measurement. rows: number of image
-    rows, from the middle of the picture. lux: ambient light; None for each scene's own.
+    scenes: bundled names, files or folders, by the names that they have in the table. airs: fog,
+    rain, snow or clear air; None for a scene's own. times_s: time of a measurement. rows: number of image rows, from
+    the middle of the picture. lux: ambient light; None for each scene's own.
     """
 
-    scenes: Sequence[str]
+    scenes: Mapping[str, str]
     airs: Sequence[str | None]
     times_s: Sequence[float]
     rules: Sequence[Rule]
@@ -154,10 +155,11 @@ def run_comparison(
     verdict: Literal["complete", "aborted"] = "complete"
     total = len(ways) * len(asked.scenes) * len(asked.airs) * len(asked.times_s) * len(asked.rules)
     try:
-        for row in _rows(config, ways, asked):
-            rows.append(row)
-            if progress is not None:
-                progress(len(rows), total)
+        for one in _parts(asked):
+            for row in _rows(config, ways, one):
+                rows.append(row)
+                if progress is not None:
+                    progress(len(rows), total)
     except KeyboardInterrupt:
         if not rows:
             raise
@@ -165,29 +167,23 @@ def run_comparison(
     return _comparison(ways, rows, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> Iterator[StrategyRow]:
-    model = rig_model(config)
-    for scene, air in product(asked.scenes, asked.airs):
-        name = scene.rstrip("/").rsplit("/", 1)[-1]
-        with part(name if air is None else f"{name}, {air}"), TemporaryDirectory() as made:
-            tell_stage("making the scene")
-            file = scene_file(scene, air, asked.lux, model, Path(made))
-            yield from _of_place(configure(config, scene=str(file)), model, ways, asked, (name, air))
+def _parts(asked: ComparisonPlan) -> Iterator[ComparisonPlan]:
+    """The parts of a comparison that are independent: one scene, air, rule and time each."""
+    for scene, air, rule, time_s in product(asked.scenes.items(), asked.airs, asked.rules, asked.times_s):
+        yield replace(asked, scenes=dict([scene]), airs=[air], rules=[rule], times_s=[time_s])
 
 
 def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
     """A case for each scene, air, rule and time, with all strategies."""
     content, names = portable_content(config), [way.name for way in ways]
     cases = []
-    for scene, air, rule, time_s in product(asked.scenes, asked.airs, asked.rules, asked.times_s):
-        there = Path(scene).exists()
-        one = replace(
-            asked, scenes=[str(Path(scene).absolute()) if there else scene], airs=[air], times_s=[time_s], rules=[rule]
-        )
-        plan = {**asdict(one), "seeds": [asked.seeds.start, asked.seeds.stop]}
-        files = files_of(content, one.scenes[0])
-        labels = {"scene": scene, "air": air, "rule": rule, "time_ms": 1e3 * time_s}
-        cases.append(Case(f"{__name__}:measure_once", {"config": content, "ways": names, "plan": plan}, labels, files))
+    for one in _parts(asked):
+        ((name, scene),) = one.scenes.items()
+        file = str(Path(scene).absolute()) if Path(scene).exists() else scene
+        plan = {**asdict(replace(one, scenes={name: file})), "seeds": [asked.seeds.start, asked.seeds.stop]}
+        labels = {"scene": scene, "air": one.airs[0], "rule": one.rules[0], "time_ms": 1e3 * one.times_s[0]}
+        inputs = {"config": content, "ways": names, "plan": plan}
+        cases.append(Case(f"{__name__}:measure_once", inputs, labels, files_of(content, file)))
     return cases
 
 
@@ -221,10 +217,21 @@ def _comparison(
     return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
 
 
+def _rows(config: RigConfig, ways: Sequence[Strategy], one: ComparisonPlan) -> Iterator[StrategyRow]:
+    """The rows of a part of a comparison."""
+    ((name, scene),), air = one.scenes.items(), one.airs[0]
+    with part(name if air is None else f"{name}, {air}"), TemporaryDirectory() as made:
+        tell_stage("making the scene")
+        model = rig_model(config)
+        file = scene_file(scene, air, one.lux, model, Path(made))
+        yield from _of_place(configure(config, scene=str(file)), model, ways, one, (name, air))
+
+
 def _of_place(
     config: RigConfig, model: RigModel, ways: Sequence[Strategy], asked: ComparisonPlan, place: tuple[str, str | None]
 ) -> Iterator[StrategyRow]:
-    """The rows of one scene and air."""
+    """The rows of one scene and air, by one rule and in one time."""
+    rule, time_s = asked.rules[0], asked.times_s[0]
     scan = config.scan
     columns = scan.columns // LINES * LINES
     commands = np.array([column_command(column, scan.command_range, columns) for column in range(columns)])
@@ -243,7 +250,7 @@ def _of_place(
         if not scored.any():
             raise UsageError(f"scene {place[0]}: the source lights nothing that the camera sees; check the scene")
 
-        def apparatus_of(rule: Rule, seed: int) -> Apparatus:
+        def apparatus_of(seed: int) -> Apparatus:
             try:
                 made: Apparatus = opened.apparatus(
                     rows=rows, columns=columns, command_range=scan.command_range, power_w=power_w, rule=rule, seed=seed,
@@ -255,8 +262,8 @@ def _of_place(
                 raise UsageError(f"{config.name}: {error}") from error
             return made
 
-        def measure(way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, float, float]:
-            apparatus = apparatus_of(rule, seed)
+        def measure(way: Strategy, seed: int) -> tuple[Answer, Spent]:
+            apparatus = apparatus_of(seed)
             try:
                 answer = way.measure(apparatus, geometry, Budget(time_s), seed)
             except (TooShort, RigError):
@@ -270,10 +277,10 @@ def _of_place(
                 raise RigError(
                     f"{way.name} took {spent.time_s * 1e3:g} ms of {time_s * 1e3:g} ms; correct the strategy"
                 )
-            return answer, spent.time_s, spent.energy_j
+            return answer, spent
 
-        apparatus_of(asked.rules[0], asked.seeds[0])  # light that all ways share is on nobody's computing time
-        for rule, time_s, way in product(asked.rules, asked.times_s, ways):
+        apparatus_of(asked.seeds[0])  # light that all ways share is on nobody's computing time
+        for way in ways:
             tell_stage(f"{way.name}, {time_s * 1e3:g} ms")
             row = StrategyRow(way.name, way.light, *place, rule, 1e3 * time_s, len(true_m))
             classes = _classes(config, geometry, way.light, power_w, rule, time_s)
@@ -281,17 +288,19 @@ def _of_place(
             begun = time.perf_counter()
             scores: list[Score] = []
             reached = Reached(true_m)
-            spent_s = energy_j = 0.0
+            spent: list[tuple[float, float]] = []
             try:
                 for seed in asked.seeds:
-                    answer, spent_s, energy_j = measure(way, rule, time_s, seed)
+                    answer, used = measure(way, seed)
+                    spent.append((used.time_s, used.energy_j))
                     scores.append(score(answer, truth, geometry, scored))
                     reached.add(answer.depth_m[scored])
             except TooShort as why:
                 yield replace(row, too_short=str(why), compute_s=time.perf_counter() - begun)
                 continue
-            row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=1e3 * spent_s)
-            yield replace(row, energy_mj=1e3 * energy_j, compute_s=time.perf_counter() - begun)
+            spent_ms, energy_mj = (1e3 * statistics.fmean(each) for each in zip(*spent, strict=True))
+            row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=spent_ms, energy_mj=energy_mj)
+            yield replace(row, compute_s=time.perf_counter() - begun)
 
 
 def require_form(answer: Answer, name: str, shape: tuple[int, int]) -> None:

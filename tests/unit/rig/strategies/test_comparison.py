@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +13,9 @@ import yaml
 
 from calibration.files.rig_file import load_rig_model
 from rig.api import compare_strategies
+from rig.api.strategies import as_cases
 from rig.errors import RigError, UsageError
+from rig.requests import StrategiesRequest
 from rig.strategies.comparison import compare
 from rig.strategies.comparison.compare import Comparison, Reached, StrategyRow, ranges, require_form, run_comparison
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
@@ -105,6 +108,22 @@ def test_own_air_is_that_of_the_scene(config):
                   for air in ("own", "clear"))  # fmt: skip
     assert (own.air, clear.air) == (None, "clear")
     assert own.good < clear.good  # the street's own is foggy
+
+
+def test_scenes_of_the_same_name_are_told_apart_and_cases_are_the_parts_of_a_comparison(config, tmp_path):
+    folders = [str(tmp_path / name / "street") for name in ("lab", "yard")]
+    for folder, depth_m in zip(folders, (2.0, 3.0), strict=True):
+        Path(folder).mkdir(parents=True)
+        surfaces = {"depth_m": np.full((40, 96), depth_m, np.float32), "albedo": np.full((40, 96), 0.5, np.float32)}
+        np.savez(Path(folder) / "world.npz", **surfaces)
+    request = StrategiesRequest(
+        **SOME | {"scenes": [*folders, "ramp"], "rules": ["energy"], "strategies": ["gray-spad"], "times": ["20ms"]}
+    )
+    whole = compare_strategies(config, request)
+    assert [row.scene for row in whole.rows] == [each for each in (*folders, "ramp") for _ in SOME["fogs"]]
+    cases, _ = as_cases(config, request)
+    parts = [StrategyRow(**row) for case in cases for row in case.call()["rows"]]
+    assert parts == [replace(row, compute_s=0.0) for row in whole.rows]
 
 
 def test_several_seeds_give_a_spread(config):

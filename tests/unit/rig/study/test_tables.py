@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rig.batch.case import Case
 from rig.batch.engine import run_batch
 from rig.batch.store import Row, Store, read_rows
 from rig.errors import UsageError
@@ -70,7 +71,7 @@ def test_errors_come_first_and_not_all_figures_are_shown() -> None:
         {"k": k, **{f"figure{n}": k + n for n in range(9)}, "stripe_error_px": k, "depth_error_m": k} for k in (1, 2)
     ]
     panels = panels_of(lines, ["k"])
-    assert [panel.title for panel in panels[:3]] == ["depth_error_m", "stripe_error_px", "figure0"]
+    assert [panel.title for panel in panels[:3]] == ["depth error (m)", "stripe error (px)", "figure0"]
     assert len(panels) == module.MOST_PANELS
 
 
@@ -110,3 +111,24 @@ def test_the_order_of_results_does_not_change_the_page_or_the_csv(tmp_path: Path
         ]
         texts.add(json.dumps(lines) + csv_of(lines))
     assert len(texts) == 1
+
+
+def test_a_page_names_scenes_by_the_last_part_of_their_paths_and_figures_in_words(tmp_path: Path) -> None:
+    folders = [str(tmp_path / name) for name in ("lab/street", "yard/street", "yard/wall")]
+    cases = [
+        Case("tests.unit.rig.study.test_tables:error_of", {"scene": scene, "n": n}, {"scene": scene, "n": n})
+        for scene in folders for n in (1, 2)
+    ]  # fmt: skip
+    with Store(tmp_path / "out", cases) as store:
+        run_batch(store, Inline())
+    page = study_report(tmp_path / "out")
+    assert f"<td>{folders[0]}</td>" in page
+    assert "<td>wall</td>" in page
+    assert folders[2] not in page
+    assert "stripe error, mean abs (px)" in page.replace("\n", " ")
+    assert "extinction (1/m)" in page
+
+
+def error_of(scene: str, n: int) -> dict[str, Any]:
+    """A case: figures with units in their names."""
+    return {"stripe_error_px": {"mean_abs": len(scene) + n}, "extinction_per_m": 0.25 * n}
