@@ -6,6 +6,7 @@ Kernels release the interpreter's lock while they run, so row threads work at th
 import os
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from itertools import pairwise
@@ -18,6 +19,9 @@ Work = Callable[[int, int], None]
 """A callback that works on a range of rows, called with the first row and the row after the last."""
 _Job = tuple[Work, int, int]
 _LEAST_URGENT = 19
+_LOOK_S = 0.01
+_stages: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
+_workers: "weakref.WeakSet[_State]" = weakref.WeakSet()
 
 
 class RowWorkers:
@@ -93,6 +97,12 @@ class _State:
         self.changed = threading.Condition()
         self.error: BaseException | None = None
         """The first failure. It is kept until all posted work is over and the caller has received it."""
+        _workers.add(self)
+
+    @property
+    def at_work(self) -> bool:
+        """Whether a thread has not yet done all that was posted."""
+        return bool(self.done) and min(self.done) < self.posted
 
 
 def yield_to_others() -> None:
@@ -139,6 +149,7 @@ class StageThread:
 
     def start(self) -> None:
         """Start the thread."""
+        _stages.add(self._thread)
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
@@ -146,3 +157,16 @@ class StageThread:
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
+
+
+def all_at_rest(within_s: float) -> bool:
+    """Wait until no thread of this module is at work, at most so long; False if one still is.
+
+    The interpreter must not end before: it takes away what compiled code still uses, and the process would crash.
+    """
+    ends_s = time.monotonic() + within_s
+    while any(each.is_alive() for each in list(_stages)) or any(each.at_work for each in list(_workers)):
+        if time.monotonic() > ends_s:
+            return False
+        time.sleep(_LOOK_S)
+    return True

@@ -4,6 +4,7 @@ It is in the package `spadrig`, because another package `rig` may have taken the
 """
 
 import json
+import signal
 import sys
 from typing import NoReturn
 
@@ -24,6 +25,7 @@ def main() -> None:
 
 def end_unloaded(code: int, problem: str, line: str) -> NoReturn:
     """End the process before the program is loaded: with a line on stderr, and with --json as one JSON object too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not take the place of the exit code
     sys.stderr.write(f"{line}\n")
     if "--json" in sys.argv:
         sys.stdout.write(json.dumps({"error": {"code": code, "problems": [problem]}}) + "\n")

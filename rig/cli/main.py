@@ -40,6 +40,8 @@ _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 _TYPER_INTERRUPTED = 130
 """Exit code that typer returns after an interrupt."""
 _AGAIN_S = 0.01
+_AT_REST_S = 10.0
+"""Longest wait for threads that an interrupt has left at work."""
 
 app = typer.Typer(
     name="rig",
@@ -79,7 +81,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             _ignore_interrupts()
         if code == _TYPER_INTERRUPTED:  # an interrupt before a command had begun, or a second one while it ended
             code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
-    sys.exit(code if isinstance(code, int) else 0)
+    code = code if isinstance(code, int) else 0
+    if argv is None:
+        _end_at_rest(code)
+    sys.exit(code)
 
 
 class _Output(io.FileIO):
@@ -111,6 +116,15 @@ def _ignore_interrupts() -> None:
         for name in ("SIGINT", *_ENDING):
             if (number := getattr(signal, name, None)) is not None:
                 signal.signal(number, signal.SIG_IGN)
+
+
+def _end_at_rest(code: int) -> None:
+    """Return when no thread of a scan is at work any more; if one goes on, end the process here, with this code."""
+    threads = sys.modules.get("rig.threads")  # without it there are no such threads, and it is slow to import
+    if threads is not None and not threads.all_at_rest(_AT_REST_S):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
 
 
 @contextmanager

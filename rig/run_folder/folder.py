@@ -17,6 +17,7 @@ import os
 import re
 import secrets
 import shutil
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import count
@@ -64,6 +65,10 @@ class RunFolder:
         self.path = Path(path).absolute()
         self._in_place = in_place
         self._limits: tuple[float, float] | None = None
+        self._files: set[str] = set()
+        """Names of the files written beside the maps; those of maps may be millions, and are only counted."""
+        self._of_maps = Counter[str]()
+        """Number of files in each folder of maps."""
         self._made_parents: list[Path] = []
         self._scratch: Path | None = None
         try:
@@ -120,6 +125,7 @@ class RunFolder:
     def remove_map(self, index: int) -> None:
         """Remove every file of a map that was not finished."""
         for file in self.place("").glob(f"*/{index:06d}.*"):
+            self._of_maps[file.parent.name] -= 1
             file.unlink(missing_ok=True)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -134,6 +140,7 @@ class RunFolder:
                 sync_folder(file.parent)
         except OSError as error:
             raise _unwritable(self.path, error) from error
+        self._files.add(name)
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file of text. Raises UsageError as `write_map` does."""
@@ -147,7 +154,7 @@ class RunFolder:
 
     def publish(self) -> Path:
         """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if that has been
-        taken meanwhile. Raises UsageError if that fails.
+        taken meanwhile. Raises UsageError if that fails, or if files that were written have gone.
         """
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
@@ -157,9 +164,24 @@ class RunFolder:
             raise _unwritable(self.path, error) from error
         self._scratch = None
         self._made_parents.clear()
+        self._require_whole(published)
         if published != self.path:
             _log.warning("%s was taken while the run went on; the run is in %s", self.path, published)
         return published
+
+    def _require_whole(self, folder: Path) -> None:
+        """Raise UsageError if somebody has removed or renamed what was written to the folder."""
+        gone = sorted(name for name in self._files if not (folder / name).exists())
+        for name, number in sorted(self._of_maps.items()):
+            try:
+                found = len(os.listdir(folder / name)) if number > 0 else 0
+            except OSError:
+                found = 0
+            gone += [f"{number - found} of {number} files of {name}"] if found < number else []
+        if gone:
+            raise UsageError(
+                f"{folder} lacks {', '.join(gone)}: somebody removed them while the folder was written; do it again"
+            )
 
     def _move(self, scratch: Path) -> Path:
         if self._in_place:
@@ -213,7 +235,8 @@ class RunFolder:
         try:
             for name, data in files.items():
                 file = self.place(name)
-                file.parent.mkdir(exist_ok=True)
+                if file.parent != self.place(""):  # that one is there, unless somebody removed it with all in it
+                    file.parent.mkdir(exist_ok=True)
                 written.append(file)
                 file.write_bytes(data)
         except BaseException as error:  # an interrupt too leaves no half of a map
@@ -222,6 +245,12 @@ class RunFolder:
             if isinstance(error, OSError):
                 raise _unwritable(self.path, error) from error
             raise
+        for name in files:
+            folder, _, in_it = name.rpartition("/")
+            if folder:
+                self._of_maps[folder] += 1
+            else:
+                self._files.add(in_it)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,10 @@
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from rig.threads import RowWorkers
+from rig.threads import RowWorkers, StageThread, all_at_rest
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1, 2, 3, 16])
@@ -79,3 +81,52 @@ def test_an_error_in_any_piece_reaches_the_caller(failing):
 
     with RowWorkers(2) as workers, pytest.raises(RuntimeError, match="broken"):
         workers.over(10, work)
+
+
+def test_threads_at_work_are_known_until_they_rest():
+    go = threading.Event()
+    stage = StageThread(go.wait, "stage")
+    assert all_at_rest(10.0)
+    stage.start()
+    assert not all_at_rest(0.0)
+    go.set()
+    assert all_at_rest(10.0)
+    go.clear()
+    with RowWorkers(2) as workers:
+        workers.post(2, lambda first, last: go.wait(10.0))
+        assert not all_at_rest(0.0)
+        go.set()
+        assert all_at_rest(10.0)
+
+
+_ENDING = """
+import atexit, sys, time
+import rig.cli.main as cli
+from rig.threads import StageThread
+
+def run():
+    while {goes_on}:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    print("stage ended", flush=True)
+
+def app(**_):
+    atexit.register(print, "interpreter ends", flush=True)
+    StageThread(run, "stage").start()
+    print("aborted")
+    return 4
+
+cli.app, cli._AT_REST_S, sys.argv = app, {within_s}, ["rig"]
+cli.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("goes_on", "within_s", "said"),
+    [(False, 60.0, ["aborted", "stage ended", "interpreter ends"]), (True, 0.2, ["aborted"])],
+)
+def test_the_interpreter_of_a_command_never_ends_under_a_thread_at_work(goes_on, within_s, said):
+    program = _ENDING.format(goes_on=goes_on, within_s=within_s)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.splitlines(), done.stderr) == (4, said, "")

@@ -1,6 +1,7 @@
 """The run folder: whole or not there, and files that other programs can read."""
 
 import json
+import shutil
 import sys
 from fractions import Fraction
 from pathlib import Path
@@ -13,6 +14,7 @@ from drivers.interfaces import SweepTruth
 from drivers.recorded import RunRecording
 from rig.depth.depth import DepthMap
 from rig.depth.reconstruct import FogEstimate, MapResult
+from rig.errors import UsageError
 from rig.geometry.stripe_table import StripeTable
 from rig.recording.writer import Recording
 from rig.run_folder.folder import RunFolder
@@ -150,6 +152,36 @@ def test_an_interrupt_in_the_middle_of_a_map_leaves_none_of_its_files(
         folder.write_json("summary.json", {})
         run = folder.publish()
     assert [file.name for file in run.rglob("*") if file.is_file()] == ["summary.json"]
+
+
+def test_what_somebody_removes_while_the_folder_is_written_is_missed(tmp_path: Path) -> None:
+    def removed_after_first_file(name: str) -> None:
+        with RunFolder(tmp_path / name) as folder:
+            folder.write_json("strategies.json", {})
+            shutil.rmtree(folder.place(""))
+            folder.write_text("strategies.csv", "a,b\n")
+            folder.publish()
+
+    with pytest.raises(UsageError, match=r"cannot write .*all: No such file"):
+        removed_after_first_file("all")
+    assert not list(tmp_path.iterdir())
+
+    def published_without(*names: str) -> None:
+        with RunFolder(tmp_path / "run") as folder:
+            folder.write_map(0, a_map(), rays())
+            folder.write_map(1, a_map(), rays())
+            folder.remove_map(1)
+            folder.write_json("summary.json", {})
+            for name in names:
+                place = folder.place(name)
+                shutil.rmtree(place) if place.is_dir() else place.unlink()
+            folder.publish()
+
+    lacks = r"run lacks summary\.json, 1 of 1 files of cloud, 1 of 2 files of depth: somebody removed them"
+    with pytest.raises(UsageError, match=lacks):
+        published_without("summary.json", "depth/000000.npy", "cloud")
+    shutil.rmtree(tmp_path / "run")
+    published_without()
 
 
 def test_a_run_whose_name_was_taken_meanwhile_is_kept_beside_it(
