@@ -112,7 +112,7 @@ def command(function: Callable[..., int | CommandResult]) -> Callable[..., None]
         except KeyboardInterrupt as interrupt:
             code = fail(EXIT_ABORTED, [], ["aborted", *getattr(interrupt, "__notes__", [])], as_json)
         except Exception as error:
-            refused, found = refused_file(error), code_of(error)
+            refused, found = refusal(error), code_of(error)
             if found is None:
                 raise
             said, notes = (refused or str(error)).splitlines(), getattr(error, "__notes__", [])
@@ -231,8 +231,10 @@ def dated(prefix: str = "") -> Path:
     return Path("runs") / datetime.now().strftime(f"{prefix}%Y%m%d-%H%M%S")
 
 
-def refused_file(error: BaseException) -> str | None:
-    """One line about a file or disk to which the system refused access; None for every other error."""
+def refusal(error: BaseException) -> str | None:
+    """One line about a file or disk to which the system refused access, or about memory; None for every other error."""
+    if isinstance(error, MemoryError):
+        return f"out of memory: {str(error) or 'there was no more'}; end other programs, or take less at a time"
     if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
         return None
     step = _STEPS.get(error.errno or 0, "check the path")
@@ -265,14 +267,16 @@ def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: obje
 
 
 def code_of(error: BaseException) -> int | None:
-    """Exit code for an error; None if it is one in the program itself. A disk without room counts as a device."""
+    """Exit code for an error; None if it is one in the program itself. A disk or a memory without room counts as a
+    device."""
     from calibration.errors import CalibrationError
     from drivers.errors import DeviceError
     from rig.errors import RigError
 
-    if any(isinstance(each, OSError) and each.errno in _FULL for each in (error, error.__cause__)):
+    full = any(isinstance(each, OSError) and each.errno in _FULL for each in (error, error.__cause__))
+    if full or isinstance(error, MemoryError):
         return EXIT_DEVICE
-    if refused_file(error):
+    if refusal(error):
         return EXIT_USAGE
     if isinstance(error, RigError):
         return error.exit_code

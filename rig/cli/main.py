@@ -30,7 +30,7 @@ from rig.cli.command import (
     add_commands,
     code_of,
     fail,
-    refused_file,
+    refusal,
     say,
     tell,
 )
@@ -177,7 +177,7 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
     as_json = "--json" in arguments
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         return _TYPER_INTERRUPTED
-    refused = refused_file(error)  # such as the shell's start-up file, which --install-completion changes
+    refused = refusal(error)  # such as the shell's start-up file, which --install-completion changes
     if refused is not None:
         return fail(code_of(error) or EXIT_USAGE, [refused], [], as_json)
     # Some versions of typer contain click and others import it, so the class of click's errors is not fixed.

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
-from drivers.errors import DeviceError
 from drivers.interfaces import SpadTiming, SweepTruth
 from drivers.replay.pace import PaceReport
 from drivers.replay.spad import ReplaySpad
@@ -30,7 +29,7 @@ from rig.depth.warm_up import warm_binding, warm_up
 from rig.devices.calibration_use import accepted_by, calibration_use, identity_of, rig_content
 from rig.devices.open import OpenRig
 from rig.devices.prepare import lead_s, most_sweeps, prepare, spare_lead_s
-from rig.errors import DevicesError, RigError, UsageError
+from rig.errors import DevicesError, UsageError
 from rig.estimate.registry import LEARNING, Learned
 from rig.geometry.windows import SweepGeometry
 from rig.plan.compile import spad_request
@@ -70,8 +69,9 @@ def run_scan(
       used; its other fields were used to open the rig and to make `run`.
     prepared: the result of `prepare` for this rig, if the caller has called it.
 
-    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does a DeviceError or RigError,
-    which is raised again once the complete maps and the recording are safe; if there is neither, nothing is left.
+    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does any error, such as one of a
+    device or for want of memory, which is raised again once the complete maps and the recording are safe; if there is
+    neither, nothing is left.
     """
     policy = Overload.parse(request.on_overload)
     require_policy(policy, rig.spad.info)
@@ -170,7 +170,7 @@ def run_scan(
                     break
         if acquisition.trouble:
             raise DevicesError("\n".join(acquisition.trouble))
-    except (KeyboardInterrupt, DeviceError, RigError) as error:
+    except (KeyboardInterrupt, Exception) as error:
         if not run.worth_keeping and not isinstance(error, KeyboardInterrupt):
             raise
         ended_by = error

@@ -37,6 +37,22 @@ def test_ctrl_c_keeps_the_whole_maps_and_exits_4(rig: Rig, small: Path, monkeypa
     assert strict(Path("run/summary.json").read_text()) == summary
 
 
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 3 GiB"), ZeroDivisionError("by 0")])
+def test_an_error_of_any_kind_keeps_the_whole_maps(
+    rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    stop_at_map(2, error, monkeypatch)
+    ran = rig("scan", small, "--maps", 5, "--out", "run")
+    assert sorted(file.name for file in Path("run/depth").glob("*.npy")) == ["000000.npy", "000001.npy"]
+    assert strict(Path("run/summary.json").read_text())["verdict"] == "aborted"
+    if isinstance(error, MemoryError):
+        told = "out of memory: Unable to allocate 3 GiB; end other programs, or take less at a time"
+        assert (ran.code, ran.problems) == (3, [f"error: {told}"])
+        assert "Traceback" not in ran.err
+    else:
+        assert ran.code == 70
+
+
 def test_an_aborted_run_says_what_of_it_is_kept(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         stop_at_map(0, KeyboardInterrupt(), patch)
