@@ -18,6 +18,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from rig.kernel_files import forgive_kernel_files
+
 VARIABLE = "NUMBA_CACHE_DIR"
 """numba's own environment variable (see its manual). A value that the user has set is kept."""
 PACKAGES = "calibration", "drivers", "rig", "sim_backend"
@@ -29,7 +31,9 @@ NOTE = "spadrig-kernels-{}.json"
 
 
 def prepare_kernels() -> None:
-    """Give numba a folder that it can write to, and remove stale kernels. Call this before numba is imported."""
+    """Give numba a folder that it can write to, remove stale kernels, and let it do without torn ones. Call this before
+    numba is imported."""
+    forgive_kernel_files()
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if VARIABLE not in os.environ and not _serves(TOP / "rig" / "__pycache__"):
         os.environ[VARIABLE] = str(home / "spadrig-kernels" if _serves(home) else _private_folder())

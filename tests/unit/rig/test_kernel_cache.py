@@ -135,3 +135,67 @@ def test_an_inlined_function_of_another_file_is_never_the_old_one(tree):
     assert both() == 2
     (tree / "rig/deep/c.py").write_text("import numba\n@numba.njit(inline='always')\ndef one():\n    return 21\n")
     assert both() == 42
+
+
+_PROGRAM = """
+import sys
+import rig  # which forgives
+import numba
+
+@numba.njit(cache=True)
+def f(x):
+    return x + 1
+
+print(f(1), f(1.5) if "both" in sys.argv else "", sum(f.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Kernels of a function for two types, and a call that runs it and gives what it prints."""
+    folder, program = tmp_path / "kernels", tmp_path / "program.py"
+    program.write_text(_PROGRAM)
+    folder.mkdir()
+
+    def run(*arguments, within=folder):
+        environment = {**os.environ, kernel_cache.VARIABLE: str(within), "PYTHONPATH": str(kernel_cache.TOP)}
+        done = subprocess.run(
+            [sys.executable, program, *arguments], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
+
+    assert run("both") == ["2", "2.5", "0"]
+    assert run("both") == ["2", "2.5", "2"]
+    return folder, run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("torn", [0, 100])
+@pytest.mark.parametrize("ending", ["nbi", "1.nbc"])
+def test_a_torn_file_of_kernels_costs_time_and_no_command(kept, ending, torn):
+    folder, run = kept
+    (file,) = folder.rglob(f"*.{ending}")
+    os.truncate(file, torn)
+    assert run("both") == ["2", "2.5", "0" if ending == "nbi" else "1"]
+    assert run("both") == ["2", "2.5", "2"]
+
+
+@pytest.mark.slow
+def test_kernels_that_two_processes_have_mixed_up_are_not_called(kept):
+    folder, run = kept
+    one, other = (next(folder.rglob(f"*.{number}.nbc")) for number in (1, 2))
+    one.write_bytes(other.read_bytes())
+    assert run("both")[:2] == ["2", "2.5"]
+    assert run("both") == ["2", "2.5", "2"]
+
+
+@pytest.mark.slow
+@posix
+def test_a_full_disk_keeps_no_kernels_and_stops_none(kept, tmp_path):
+    _, run = kept
+    limited = tmp_path / "limited.py"
+    limited.write_text(f"import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))\n{_PROGRAM}")
+    (tmp_path / "program.py").write_text(limited.read_text())
+    (tmp_path / "full").mkdir()
+    assert run("both", within=tmp_path / "full") == ["2", "2.5", "0"]
