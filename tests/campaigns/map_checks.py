@@ -22,8 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from rig.batch.case import Case
 from rig.count.map_checks import SURE, MapChecks, check_points
 from rig.estimate.registry import LEARNING
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstructor_of, volume_of, windowed
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import pane_scene, random_scene, thin_scene
@@ -63,8 +65,8 @@ def _scene(rng: np.random.Generator) -> Scene:
     return whole.part(slice(first, first + ROWS))
 
 
-def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, dict[str, tuple[str, ...]], float]:
-    """What a map is, what speaks against it and its faulty kin, and the share of its sure answers that are right."""
+def one_map(seed: int, estimator: str, exposures: int, stream: bool) -> dict[str, Any]:
+    """A map as a case: what it is, what speaks against it and its faulty kin, how much of what is sure is right."""
     rng = np.random.default_rng([seed, 79])
     light, rig, scene = str(rng.choice(list(POINTS))), str(rng.choice(list(RIGS))), _scene(rng)
     geometry = Geometry.build(width=512, height=ROWS, columns=COLUMNS, **RIGS[rig])
@@ -94,31 +96,41 @@ def _one(seed: int, estimator: str, exposures: int, stream: bool) -> tuple[str, 
             sure = result.stripe.confidence >= SURE
             error = np.abs(result.stripe.x_px - point.truth())
             right = float(np.mean(error[sure] <= 1)) if sure.any() else np.nan
-    return f"{scene.name}, {light}, K = {exposures}, {rig}, seed {seed}", doubts, right
+    return {"what": f"{scene.name}, {light}, K = {exposures}, {rig}, seed {seed}", "doubts": doubts, "right": right}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the maps and print the table; 1 where a right map was doubted."""
+    """Draw the maps and print the table; 1 where a right map was doubted, or a case failed."""
     parser = argparse.ArgumentParser(description="right and wrong maps against the checks of map_checks")
     parser.add_argument("--maps", type=int, default=120)
     parser.add_argument("--estimator", default="argmax")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stream", action="store_true", help="judge by the lines that a stream keeps")
+    add_options(parser)
     asked = parser.parse_args(arguments)
     maps: defaultdict[str, Counter[int]] = defaultdict(Counter)
     found: defaultdict[str, Counter[int]] = defaultdict(Counter)
-    for index in range(asked.maps):
-        exposures = EXPOSURES[index % len(EXPOSURES)]
-        what, doubts, right = _one(asked.seed * 100_000 + index, asked.estimator, exposures, asked.stream)
-        for fault, reasons in doubts.items():
-            maps[fault][exposures] += 1
-            found[fault][exposures] += bool(reasons)
-        if doubts["none"]:
-            print(f"doubted: {what}, {right:.2f} of the sure answers right: {doubts['none'][0]}", flush=True)
+    maps_asked = [
+        {"seed": asked.seed * 100_000 + index, "estimator": asked.estimator, "stream": asked.stream,
+         "exposures": EXPOSURES[index % len(EXPOSURES)]}
+        for index in range(asked.maps)
+    ]  # fmt: skip
+    cases = [Case("tests.campaigns.map_checks:one_map", each, {"seed": each["seed"]}) for each in maps_asked]
+    results = results_of(cases, asked.workers, asked.out)
+    for each, result in zip(maps_asked, results, strict=True):
+        if result is None:
+            continue
+        for fault in [fault for fault in ("none", *FAULTS) if fault in result["doubts"]]:
+            reasons = result["doubts"][fault]
+            maps[fault][each["exposures"]] += 1
+            found[fault][each["exposures"]] += bool(reasons)
+        if result["doubts"]["none"]:
+            reason = result["doubts"]["none"][0]
+            print(f"doubted: {result['what']}, {result['right']} of the sure answers right: {reason}", flush=True)
     table = Table(("fault", *(f"K = {k}" for k in EXPOSURES)))
     for fault, of in maps.items():
         table.add((fault, *(f"{found[fault][k]} of {of[k]}" for k in EXPOSURES)))
-    return 1 if sum(found["none"].values()) else 0
+    return int(sum(found["none"].values()) > 0 or None in results)
 
 
 if __name__ == "__main__":

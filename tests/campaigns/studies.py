@@ -3,7 +3,7 @@
 import argparse
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from rig.batch.case import Case
 from rig.batch.engine import run_batch
 from rig.batch.pool import Limits, Pool
 from rig.batch.store import Store
+from rig.batch.task import FILES
 from rig.progress import Step, listening
 
 LONGEST_S = 3600.0
@@ -23,14 +24,18 @@ def add_options(parser: argparse.ArgumentParser, workers: int = 2) -> None:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keeps results: the same command goes on from there")
 
 
-def results_of(cases: Sequence[Case], workers: int, out: Path | None = None) -> list[dict[str, Any] | None]:
+def results_of(
+    cases: Sequence[Case], workers: int, out: Path | None = None, read: Callable[[Path], Any] | None = None
+) -> list[dict[str, Any] | None]:
     """Results of the cases, in order; None for one that failed, which is told. out: folder in which they are kept.
 
-    Temporary files of the cases are below one folder, which is gone afterwards, even those of cases that were killed.
+    read: called with the folder of each case that keeps files; what it returns is the result's item 'kept'. Temporary
+    files of the cases are below one folder, which is gone afterwards, even those of cases that were killed.
     """
     with ExitStack() as stack:
         memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-campaign-", dir=memory))
+        tempfile.gettempdir()  # remembered: this process must not use the folder of the cases when that is gone
         before, os.environ["TMPDIR"] = os.environ.get("TMPDIR"), scratch
         stack.callback(_put_back, before)
         store = stack.enter_context(Store(out or Path(scratch) / "results", cases))
@@ -41,6 +46,9 @@ def results_of(cases: Sequence[Case], workers: int, out: Path | None = None) -> 
         if done.verdict == "aborted":
             raise KeyboardInterrupt
         found = {row.case: {**row.result, "measured": row.measured} for row in store.rows()}
+        if read is not None:
+            for name, result in found.items():
+                result["kept"] = read(store.folder / FILES / name)
         return [found.get(name) for name in store.names]
 
 

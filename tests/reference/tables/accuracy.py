@@ -22,7 +22,7 @@ from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstruct
 from tests.reference.genie import Genie
 from tests.reference.geometry import Geometry
-from tests.reference.tables.printed import Table, names_asked, parser_of, scene_named, scenes_asked
+from tests.reference.tables.printed import Table, parser_of, scene_of, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, score
 
 ESTIMATORS = ("argmax", "edge", "likelihood")
@@ -92,8 +92,7 @@ def one_cell(
 ) -> dict[str, Any]:
     """A scene at a point with a number of exposures as a case: [name, figures] of every estimator and filter."""
     measurement = Measurement(estimators, filters, {"genie": Genie()}, row_step)
-    found = scene_named(scene)
-    assert found is not None, "it was there when the table was asked for"
+    found = scene_of(scene)
     height, width = found.shape
     geometry = Geometry.build(width=width, height=height, **RIGS[rig])  # type: ignore[arg-type]
     means = list(measurement.means(WorkingPoint(found, POINTS[point], geometry), exposures, seeds))
@@ -112,15 +111,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--row-step", type=int, default=1, help="score every n-th row only")
     add_options(parser, workers=1)
     options = parser.parse_args(arguments)
-    scenes_asked(parser, options.scenes)  # or an error that names the one that is absent
     fixed = {
         "rig": options.rig, "seeds": options.seeds, "row_step": options.row_step,
         "estimators": options.estimators.split(","), "filters": options.filters.split(","),
     }  # fmt: skip
+    scenes = scenes_asked(parser, options.scenes)
     cells = [
         {"point": point, "scene": scene, "exposures": int(exposures)}
         for point in options.points.split(",")
-        for scene in names_asked(options.scenes)
+        for scene in scenes
         for exposures in (options.exposures.split(",") if options.exposures else DEFAULT_EXPOSURES[point])
     ]
     cases = [Case("tests.reference.tables.accuracy:one_cell", {**each, **fixed}, each) for each in cells]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,16 @@ class Answers:
         error = (x - truth).astype(np.float32).ravel()
         scored = point.trusted[rows].ravel()
         return cls(error, confidence.ravel(), scored, np.isfinite(truth).ravel(), result.compute_s)
+
+    def save(self, file: Path) -> None:
+        """Keep the answers in a file of this name, `.npz`."""
+        np.savez(file, **asdict(self))
+
+    @classmethod
+    def load(cls, file: Path) -> Answers:
+        """The answers of such a file."""
+        with np.load(file) as kept:
+            return cls(**{name: kept[name] for name in kept.files if name != "seconds"}, seconds=float(kept["seconds"]))
 
     def over(self, wanted: NDArray[np.bool_]) -> Answers:
         """These answers with other stripes scored."""

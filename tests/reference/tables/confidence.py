@@ -17,17 +17,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import depth_with_floating, reconstructor_of, volume_of
 from tests.reference.geometry import BASELINE_M, FOCAL_PX, Geometry
 from tests.reference.scene import Scene
 from tests.reference.tables.accuracy import RIGS
 from tests.reference.tables.answers import WITHIN_PX, Answers, calibration_error, pooled, reliability
-from tests.reference.tables.printed import Table, parser_of, scenes_asked
+from tests.reference.tables.joint_accuracy import kept_answers
+from tests.reference.tables.printed import Table, parser_of, scene_of, scenes_asked
 from tests.reference.working_point import POINTS, REPORT, WorkingPoint
 
 SURE, TAKEN = 0.9, 0.5
@@ -108,24 +112,45 @@ def cells_of(seen: Sequence[_Seen]) -> list[str]:
     ]  # fmt: skip
 
 
+def one_map(scene: str, point: str, exposures: int, estimators: Sequence[str], seed: int, keep: str) -> dict[str, Any]:
+    """What is seen in one map by each estimator as a case: the answers kept in files, the rest returned."""
+    seen = answers_of(scene_of(scene), point, exposures, estimators, seed)
+    Path(keep).mkdir(parents=True)
+    for name, one in zip(estimators, seen, strict=True):
+        one.answers.save(Path(keep) / f"{name}.npz")
+    return {name: [one.floats, one.points.tolist()] for name, one in zip(estimators, seen, strict=True)}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """A line for each point and estimator."""
+    """A line for each point and estimator. 1 where a map failed."""
     parser = parser_of(
         "tests.reference.tables.confidence", __doc__,
         points="report-1,report-3,report-10,dense-3,dense-10,clear-1,clear-3,uneven-10,turned-10",
     )  # fmt: skip
     parser.add_argument("--estimators", default="likelihood,joint")
     parser.add_argument("--seed", type=int, default=1)
+    add_options(parser, workers=1)
     options = parser.parse_args(arguments)
     scenes, estimators = scenes_asked(parser, options.scenes), options.estimators.split(",")
+    maps = [
+        {"point": point, "exposures": int(exposures), "scene": scene}
+        for point, exposures in (asked.rsplit("-", 1) for asked in options.points.split(","))
+        for scene in scenes
+    ]
+    fixed = {"estimators": estimators, "seed": options.seed}
+    cases = [Case("tests.reference.tables.confidence:one_map", {**each, **fixed}, each, keeps=True) for each in maps]
+    results = results_of(cases, options.workers, options.out, kept_answers)
+    seen: dict[tuple[object, ...], list[_Seen]] = {}
+    for each, result in zip(maps, results, strict=True):
+        for name in estimators if result is not None else ():
+            floats, points = result[name]
+            one = _Seen(result["kept"][name], np.nan if floats is None else floats, np.array(points))
+            seen.setdefault((each["point"], each["exposures"], name), []).append(one)
     table = Table(TITLES)
-    for asked in options.points.split(","):
-        point, exposures = asked.rsplit("-", 1)
-        seen = [answers_of(scene, point, int(exposures), estimators, options.seed) for scene in scenes]
-        for index, estimator in enumerate(estimators):
-            table.add([point, exposures, estimator, *cells_of([of_scene[index] for of_scene in seen])])
+    for line, of_scenes in seen.items():
+        table.add([*line, *cells_of(of_scenes)])
     table.write(options.markdown)
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

@@ -17,17 +17,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.clock import VirtualClock
 from drivers.registry import Surroundings
+from rig.batch.case import Case
 from rig.config.overrides import configure
 from sim_backend.frames.flux import FluxModel
 from sim_backend.light.view import CameraView, make_view
 from sim_backend.scenes.surfaces import Surfaces
 from sim_backend.world import SimulatedWorld, WorldConfig
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.tables.printed import Table, parser_of
 
 Array = NDArray[np.floating]
@@ -126,25 +129,43 @@ def _shift_px(world: SimulatedWorld, plane: Array, near_m: float, far_m: float) 
     return float(np.nanmax(both)) if np.isfinite(both).any() else float(world.size[1])
 
 
+def one_scene(
+    scene: str, exposures: Sequence[int], seeds: int, columns: int, row_step: int
+) -> dict[str, list[list[object]]]:
+    """The genie in a scene as a case: the lines of the table."""
+    genie, cells = DenseFogGenie(scene, columns, row_step), []
+    for k, seed in product(exposures, range(FIRST_SEED, FIRST_SEED + seeds)):
+        error = genie.errors(k, seed)
+        figures = f"{error.mean():.2f}", f"{np.median(error):.3f}", f"{(error <= 1.0).mean():.3f}"
+        cells.append([scene, k, seed, len(error), *figures])
+    return {"cells": cells}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print a line for every seed as it comes; write the table where wanted."""
+    """Print a line for every seed; write the table where wanted. 1 where a scene failed."""
     parser = parser_of("tests.reference.tables.dense_fog_genie", __doc__)
     parser.set_defaults(scenes="street-dense-fog")
     parser.add_argument("--exposures", default="10,20")
     parser.add_argument("--columns", type=int, default=10, help="positions of the line, evenly spread over the sweep")
     parser.add_argument("--row-step", type=int, default=8)
     parser.add_argument("--seeds", type=int, default=3, help=f"draws of each kind, from seed {FIRST_SEED} on")
+    add_options(parser)
     options = parser.parse_args(arguments)
+    fixed = {
+        "exposures": [int(k) for k in options.exposures.split(",")], "seeds": options.seeds,
+        "columns": options.columns, "row_step": options.row_step,
+    }  # fmt: skip
+    cases = [
+        Case("tests.reference.tables.dense_fog_genie:one_scene", {"scene": scene, **fixed}, {"scene": scene})
+        for scene in options.scenes.split(",")
+    ]
+    results = results_of(cases, options.workers, options.out)
     table = Table(TITLES)
-    for scene in options.scenes.split(","):
-        genie = DenseFogGenie(scene, options.columns, options.row_step)
-        for exposures in map(int, options.exposures.split(",")):
-            for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
-                error = genie.errors(exposures, seed)
-                figures = f"{error.mean():.2f}", f"{np.median(error):.3f}", f"{(error <= 1.0).mean():.3f}"
-                table.add([scene, exposures, seed, len(error), *figures])
+    for result in results:
+        for cells in result["cells"] if result is not None else ():
+            table.add(cells)
     table.write(options.markdown)
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

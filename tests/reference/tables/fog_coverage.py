@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
+from rig.batch.case import Case
 from rig.depth.fog_meter import VISIBILITY_CONTRAST
+from tests.campaigns.studies import add_options, results_of
 from tests.reference import kernels
 from tests.reference.adapter import reconstruct
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene
-from tests.reference.tables.printed import scenes_asked
+from tests.reference.tables.printed import scene_of, scenes_asked
 from tests.reference.working_point import Light, WorkingPoint
 
 SENSORS = ((64, 128), (128, 250), (96, 160), (48, 96))
@@ -86,6 +89,14 @@ def run(scene: Scene, light: Light, exposures: int, sensor: tuple[int, int], see
     }
 
 
+def one_run(
+    scene: str, light: dict[str, Any], exposures: int, sensor: Sequence[int], seed: int
+) -> dict[str, dict[str, float | None]]:
+    """The readings of one map as a case."""
+    found = run(scene_of(scene), Light(**light), exposures, (sensor[0], sensor[1]), seed)
+    return {name: asdict(reading) for name, reading in found.items()}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
@@ -93,13 +104,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
+    add_options(parser)
     options = parser.parse_args(arguments)
     scenes = scenes_asked(parser, None)
+    runs = [
+        {"scene": scenes[i % len(scenes)], "light": asdict(light), "exposures": exposures,
+         "sensor": SENSORS[i % len(SENSORS)], "seed": 1000 * options.seed + i}
+        for i, (light, exposures) in zip(range(options.runs), lights(options.seed), strict=False)
+    ]  # fmt: skip
+    cases = [Case("tests.reference.tables.fog_coverage:one_run", each, {"seed": each["seed"]}) for each in runs]
+    results = results_of(cases, options.workers, options.out)
     pulls: dict[str, list[float]] = {name: [] for name in FIGURES}
-    for i, (light, exposures) in zip(range(options.runs), lights(options.seed), strict=False):
-        scene, sensor = scenes[i % len(scenes)], SENSORS[i % len(SENSORS)]
-        found = run(scene, light, exposures, sensor, 1000 * options.seed + i)
-        shown = [f"{i} {scene.name} {sensor[0]} x {sensor[1]} K = {exposures}"]
+    for i, (each, result) in enumerate(zip(runs, results, strict=True)):
+        if result is None:
+            continue
+        found = {name: Reading(**result[name]) for name in FIGURES}
+        shown = [f"{i} {each['scene']} {each['sensor'][0]} x {each['sensor'][1]} K = {each['exposures']}"]
         for name, reading in found.items():
             if reading.pull is None:
                 shown.append(f"{name} {reading.truth:.4f}: not resolved")
@@ -107,13 +127,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 pulls[name].append(reading.pull)
                 shown.append(f"{name} {reading.truth:.4f}: {reading.value:.4f} +- {reading.sd:.4f}")
         print("; ".join(shown), flush=True)
-    for name, each in pulls.items():
-        size = np.abs(each)
+    for name, of_figure in pulls.items():
+        size = np.abs(of_figure)
         print(
-            f"{name}: {len(each)} of {options.runs} resolved, {np.mean(size <= 1):.0%} within 1 sd, "
-            f"{np.mean(size <= SD_OF_95):.0%} in 95 %, mean pull {np.mean(each):+.2f}"
+            f"{name}: {len(of_figure)} of {options.runs} resolved, {np.mean(size <= 1):.0%} within 1 sd, "
+            f"{np.mean(size <= SD_OF_95):.0%} in 95 %, mean pull {np.mean(of_figure):+.2f}"
         )
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

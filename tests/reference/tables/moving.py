@@ -21,11 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.geometry import FOCAL_PX
 from tests.reference.scene import Scene, surroundings
 from tests.reference.tables.answers import Answers, calibration_error, pooled
-from tests.reference.tables.printed import Table, parser_of, scenes_asked
+from tests.reference.tables.printed import Table, parser_of, scene_of, scenes_asked
 from tests.reference.working_point import POINTS, WorkingPoint, at_stripe
 
 PARTS = ("all", "disc", "uncovered", "still")
@@ -136,22 +138,33 @@ def row_of(name: str, moves: str, exposures: int, both: tuple[Moved, Moved]) -> 
     return [name, moves, exposures, *cells, within, calibration]
 
 
+def one_cell(scene: str, rows: int | None, moves: str, exposures: int, maps: int, point: str) -> dict[str, Any]:
+    """A line of the table as a case."""
+    both = measure(scene_of(scene, rows), DISCS[moves], exposures, maps, point)
+    return {"cells": row_of(scene, moves, exposures, both)}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table."""
+    """Print the table. 1 where a line failed."""
     parser = parser_of("tests.reference.tables.moving", __doc__)
     parser.add_argument("--moves", default=",".join(DISCS), help=f"of {', '.join(DISCS)}")
     parser.add_argument("--exposures", default="1,3")
     parser.add_argument("--point", default="report", choices=POINTS)
     parser.add_argument("--maps", type=int, default=4)
     parser.add_argument("--rows", type=int, help="middle rows of the scenes")
+    add_options(parser, workers=1)
     options = parser.parse_args(arguments)
-    scenes = scenes_asked(parser, options.scenes, options.rows)
+    fixed = {"rows": options.rows, "maps": options.maps, "point": options.point}
+    asked = scenes_asked(parser, options.scenes), options.moves.split(","), map(int, options.exposures.split(","))
+    lines = [{"scene": scene, "moves": moves, "exposures": k} for scene, moves, k in product(*asked)]
+    cases = [Case("tests.reference.tables.moving:one_cell", {**each, **fixed}, each) for each in lines]
+    results = results_of(cases, options.workers, options.out)
     table = Table(TITLES)
-    for scene, moves, k in product(scenes, options.moves.split(","), map(int, options.exposures.split(","))):
-        both = measure(scene, DISCS[moves], k, options.maps, options.point)
-        table.add(row_of(scene.name, moves, k, both))
+    for result in results:
+        if result is not None:
+            table.add(result["cells"])
     table.write(options.markdown)
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

@@ -19,10 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstructor_of, volume_of
 from tests.reference.geometry import Geometry
 from tests.reference.scene import Scene
-from tests.reference.tables.printed import Table, parser_of, scenes_asked
+from tests.reference.tables.printed import Table, parser_of, scene_of, scenes_asked
 from tests.reference.working_point import POINTS, THREADS, WorkingPoint, score
 
 FRAME_MS = 0.01
@@ -116,34 +118,51 @@ TITLES = ("scene", "point", "power", "lines", "K", "lit ms", "overlap", "estimat
           "within 1 px", "confidence")  # fmt: skip
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table, and write it where asked."""
+def one_kind(
+    scene: str, point: str, power: str, lines: int, exposures: Sequence[int], estimators: Sequence[str]
+) -> dict[str, Any]:
+    """Maps of a scene with so many lines as a case: the lines of the table."""
     from rig.geometry.line_grid import window_overlap
 
+    together, world = Lines(lines, power), working_point(scene_of(scene), point)
+    overlap = window_overlap(together.grid, reconstructor_of(world, "argmax").geometry)
+    cells = []
+    for k in sorted({*exposures, *(lines * k for k in exposures)}):
+        lit_ms = COLUMNS // lines * k * FRAME_MS
+        for estimator, f in measure(world, together, k, estimators):
+            told = scene, point, power, lines, k, f"{lit_ms:.1f}", f"{overlap:.2f}", estimator
+            found = (f[figure] for figure in ("mean_abs_charged", "median_abs", "within_1px", "confidence"))
+            cells.append([*told, *(f"{one:.3f}" for one in found)])
+    return {"cells": cells}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, and write it where asked. 1 where a case failed."""
     parser = parser_of("tests.reference.tables.multi_line", __doc__, points="clear,report,dense")
     parser.set_defaults(scenes="procedural")
     parser.add_argument("--power", default="shared,each")
     parser.add_argument("--lines", default="1,2,4,8")
     parser.add_argument("--exposures", default="1,10", help="of one line; others take them and as many frames a map")
     parser.add_argument("--estimators", default="likelihood,joint")
+    add_options(parser, workers=1)
     options = parser.parse_args(arguments)
-    table = Table(TITLES)
-    base = [int(k) for k in options.exposures.split(",")]
     powers, scenes = options.power.split(","), scenes_asked(parser, options.scenes)
-    for scene, kind, power, count in product(scenes, options.points.split(","), powers, options.lines.split(",")):
-        lines = Lines(int(count), power)
-        if lines.lines == 1 and power != powers[0]:
-            continue
-        point = working_point(scene, kind)
-        overlap = window_overlap(lines.grid, reconstructor_of(point, "argmax").geometry)
-        for k in sorted({*base, *(lines.lines * k for k in base)}):
-            lit_ms = COLUMNS // lines.lines * k * FRAME_MS
-            for estimator, f in measure(point, lines, k, options.estimators.split(",")):
-                told = scene.name, kind, power, count, k, f"{lit_ms:.1f}", f"{overlap:.2f}", estimator
-                found = (f[figure] for figure in ("mean_abs_charged", "median_abs", "within_1px", "confidence"))
-                table.add([*told, *(f"{one:.3f}" for one in found)])
+    fixed = {
+        "exposures": [int(k) for k in options.exposures.split(",")], "estimators": options.estimators.split(","),
+    }  # fmt: skip
+    kinds = [
+        {"scene": scene, "point": point, "power": power, "lines": int(lines)}
+        for scene, point, power, lines in product(scenes, options.points.split(","), powers, options.lines.split(","))
+        if int(lines) > 1 or power == powers[0]
+    ]
+    cases = [Case("tests.reference.tables.multi_line:one_kind", {**each, **fixed}, each) for each in kinds]
+    results = results_of(cases, options.workers, options.out)
+    table = Table(TITLES)
+    for result in results:
+        for cells in result["cells"] if result is not None else ():
+            table.add(cells)
     table.write(options.markdown)
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.adapter import reconstruct
 from tests.reference.geometry import Geometry
 from tests.reference.made_scenes import noise, random_scene
@@ -76,29 +79,43 @@ def figures(confidence: NDArray[np.float32], x_px: NDArray[np.float32], point: W
     )
 
 
+def one_scene(number: int, points: Sequence[str], threads: int) -> dict[str, Any]:
+    """The maps of a random scene as a case: [point, exposures, figures] of each."""
+    rng = np.random.default_rng([number, 79])
+    scene, maps = opened(random_scene(number, ROWS), number), []
+    for name in points:
+        point, exposures = OpenPoint(scene, drawn_light(name, rng)), int(rng.choice([1, 3, 10, 20]))
+        counts = point.counts(exposures, number)
+        (result,) = reconstruct(point, counts, exposures, estimator="joint", threads=threads)
+        maps.append([name, exposures, figures(result.stripe.confidence, result.stripe.x_px, point)])
+    return {"maps": maps}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """A row per map, then their means."""
+    """A row per map, then their means. 1 where a scene failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", default="306:312", help="first and last but one of the random scenes")
     parser.add_argument("--points", default="clear,report,dense", help=f"of {', '.join(POINTS)}")
     parser.add_argument("--threads", type=int, default=2)
+    add_options(parser, workers=1)
     options = parser.parse_args(arguments)
-    first, end = map(int, options.scenes.split(":"))
+    numbers = range(*map(int, options.scenes.split(":")))
+    fixed = {"points": options.points.split(","), "threads": options.threads}
+    cases = [
+        Case("tests.reference.tables.open_scenes:one_scene", {"number": number, **fixed}, {"scene": number})
+        for number in numbers
+    ]
+    results = results_of(cases, options.workers, options.out)
     print("scene point K | empty | error over all, with stripe | empty taken, right taken")
     seen: dict[str, list[tuple[float, ...]]] = {}
-    for number in range(first, end):
-        rng = np.random.default_rng([number, 79])
-        scene = opened(random_scene(number, ROWS), number)
-        for name in options.points.split(","):
-            point, exposures = OpenPoint(scene, drawn_light(name, rng)), int(rng.choice([1, 3, 10, 20]))
-            counts = point.counts(exposures, number)
-            (result,) = reconstruct(point, counts, exposures, estimator="joint", threads=options.threads)
-            row = figures(result.stripe.confidence, result.stripe.x_px, point)
+    for number, result in zip(numbers, results, strict=True):
+        for name, exposures, row in result["maps"] if result is not None else ():
+            row = [np.nan if value is None else value for value in row]
             seen.setdefault(name, []).append(row)
             print(number, name, exposures, "|", *(f"{value:.3f}" for value in row), flush=True)
     for name, rows in seen.items():
         print("mean", name, "|", *(f"{value:.3f}" for value in np.mean(rows, axis=0)))
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":

@@ -46,21 +46,22 @@ def parser_of(program: str, doc: str | None, points: str | None = None) -> argpa
     return parser
 
 
-def scenes_asked(parser: argparse.ArgumentParser, names: str | None, rows: int | None = None) -> list[Scene]:
-    """The scenes of these names; by default all prepared ones or, where there are none, the built-in one.
+def scenes_asked(parser: argparse.ArgumentParser, names: str | None) -> Sequence[str]:
+    """Names of the scenes asked for; by default all prepared ones or, where there are none, the built-in one.
 
-    rows: the middle ones of each, None for all.
+    Ends the program if one of them is absent.
     """
-    scenes = [scene_named(name) for name in names_asked(names)]
-    found = [scene for scene in scenes if scene is not None]
-    if len(found) < len(scenes):
+    wanted = names.split(",") if names else scene_names() or ("procedural",)
+    if any(scene_named(name) is None for name in wanted):
         parser.error(f"a scene of {names} is absent; present: {', '.join([*scene_names(), 'procedural'])}")
-    return [scene if rows is None else scene.crop(min(rows, scene.shape[0]), scene.shape[1]) for scene in found]
+    return wanted
 
 
-def names_asked(names: str | None) -> Sequence[str]:
-    """Names of the scenes: those asked for or, by default, those of `scenes_asked`."""
-    return names.split(",") if names else scene_names() or ("procedural",)
+def scene_of(name: str, rows: int | None = None) -> Scene:
+    """The scene of a name that is present. rows: the middle ones, None for all."""
+    scene = scene_named(name)
+    assert scene is not None, f"{name} was there when the table was asked for"
+    return scene if rows is None else scene.crop(min(rows, scene.shape[0]), scene.shape[1])
 
 
 def scene_named(name: str) -> Scene | None:

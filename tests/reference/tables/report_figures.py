@@ -5,35 +5,36 @@
 
 What each figure of the report shows is not known here; docs/how-to/tradeoff.md says what ours stand for. Counts come
 from the yardstick's own simulator at the report's working point, five prepared scenes where they are there; errors are
-of stripes on trusted pixels against the continuous truth, a missing answer counts as 10 px. `--measured FILE` keeps
-what figures 7 to 9 are drawn from; what it holds is not measured again. The table for docs/how-to/tradeoff.md is
+of stripes on trusted pixels against the continuous truth, a missing answer counts as 10 px. `--kept FOLDER` keeps
+what figures 7 to 9 are drawn from; what is there is not measured again. The table for docs/how-to/tradeoff.md is
 printed.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from base64 import b64encode
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from html import escape
-from itertools import product
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.batch.case import Case
 from rig.estimate.registry import ESTIMATORS, FILTERS
 from rig.report.charts import INK, Panel, Point, Series, chart_svg
 from rig.run_folder.pictures import depth_scale, png_bytes
 from rig.tradeoff.files import colour_of
+from tests.campaigns.studies import results_of
 from tests.reference.adapter import reconstruct
 from tests.reference.scene import Scene
 from tests.reference.tables.accuracy import Measurement, named
-from tests.reference.tables.printed import Table, parser_of, scenes_asked
+from tests.reference.tables.printed import Table, parser_of, scene_of, scenes_asked
 from tests.reference.working_point import CLEAR, DENSE, POINTS, REPORT, WorkingPoint
 
 COLUMNS, FRAME_RATE_HZ = 500, 100_000
@@ -68,25 +69,15 @@ class Figure:
     compute_s: float
 
 
-def measure(
-    scenes: Sequence[Scene],
-    points: Sequence[str],
-    exposures: Sequence[int],
-    estimators: Sequence[str],
-    known: Collection[tuple[str, str, int, str]] = (),
-) -> Iterator[Figure]:
-    """Every combination, one map each, which the estimator learns from as well; but for those that are known."""
-    for point_name, scene in product(points, scenes):
-        point = WorkingPoint(scene, POINTS[point_name])
-        for k in exposures:
-            wanted = [name for name in estimators if (point_name, scene.name, k, name) not in known]
-            if not wanted:
-                continue
-            for estimator, filter, found, compute_s in Measurement(wanted, FILTERS).of(point, point.counts(k, SEED), k):
-                yield Figure(
-                    point_name, scene.name, k, estimator, filter, found["mean_abs_charged"],
-                    found["within_1px"], found["mean_abs_rounded"], compute_s,
-                )  # fmt: skip
+def one_map(scene: str, point: str, exposures: int, estimators: Sequence[str]) -> dict[str, Any]:
+    """The figures of a map as a case: one map, from which each estimator learns as well."""
+    world, figures, times_s = WorkingPoint(scene_of(scene), POINTS[point]), [], []
+    counts = world.counts(exposures, SEED)
+    for estimator, filter, found, compute_s in Measurement(estimators, FILTERS).of(world, counts, exposures):
+        px = found["mean_abs_charged"], found["within_1px"], found["mean_abs_rounded"]
+        figures.append([point, scene, exposures, estimator, filter, *px])
+        times_s.append(compute_s)
+    return {"figures": figures, "measured": {"compute_s": times_s}}
 
 
 def figure_3(scene: Scene) -> str:
@@ -299,25 +290,30 @@ class DepthMap:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, draw and print."""
+    """Measure, draw and print. 1 where a map failed."""
     parser = parser_of("tests.reference.tables.report_figures", __doc__, points="report,dense,clear")
     parser.add_argument("--out", type=Path, required=True, help="folder for the SVG files")
     parser.add_argument("--exposures", default=",".join(map(str, EXPOSURES)))
     parser.add_argument("--estimators", default=",".join(ESTIMATORS))
-    parser.add_argument("--measured", type=Path, help="file of measurements: read where it is there, else written")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--kept", type=Path, help="folder that keeps measurements: the same command goes on from there")
     options = parser.parse_args(arguments)
     scenes = scenes_asked(parser, options.scenes)
     options.out.mkdir(parents=True, exist_ok=True)
-    kept: Path | None = options.measured
-    figures = [] if kept is None or not kept.exists() else [Figure(**one) for one in json.loads(kept.read_text())]
-    known = {(figure.point, figure.scene, figure.exposures, figure.estimator) for figure in figures}
-    exposures = [int(k) for k in options.exposures.split(",")]
-    for figure in measure(scenes, options.points.split(","), exposures, options.estimators.split(","), known):
-        figures.append(figure)
-        print(figure, file=sys.stderr, flush=True)
-        if kept is not None and figure.filter == FILTERS[-1]:
-            kept.write_text(json.dumps([asdict(one) for one in figures]))
-    first = next((scene for scene in scenes if scene.name == "cones"), scenes[0])
+    maps = [
+        {"point": point, "scene": scene, "exposures": int(exposures)}
+        for point in options.points.split(",") for scene in scenes for exposures in options.exposures.split(",")
+    ]  # fmt: skip
+    fixed = {"estimators": options.estimators.split(",")}
+    cases = [Case("tests.reference.tables.report_figures:one_map", {**each, **fixed}, each) for each in maps]
+    results = results_of(cases, options.workers, options.kept)
+    figures = [
+        Figure(*figure, compute_s)
+        for result in results
+        if result is not None
+        for figure, compute_s in zip(result["figures"], result["measured"]["compute_s"], strict=True)
+    ]
+    first = scene_of("cones" if "cones" in scenes else scenes[0])
     drawn = {
         "3-row": figure_3(first),
         "4-exposures": figure_4(first),
@@ -329,7 +325,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, text in drawn.items():
         (options.out / f"report-{name}.svg").write_text(text)
     claims_table(figures).write(options.markdown)
-    return 0
+    return int(None in results)
 
 
 if __name__ == "__main__":
