@@ -171,6 +171,8 @@ def stream(seconds: float, rate: str, config: str, estimator: str, exposures: in
                 continue
             late_s = now_s - spad.started_s - found.sweep.end_frame * frame_s
             samples.put({"map late, ms": 1e3 * late_s})
+            if time.monotonic() - samples.begun_s > seconds:  # where frames are lost, maps are made of later ones
+                break
             if now_s >= next_s:
                 next_s = now_s + 0.5
                 samples.process()

@@ -7,12 +7,18 @@ that outlive it (tests/wire/scans). Light is emission AND gate. Passes where lig
 99.9th percentile and never there after 500 ms, for each sort of blow (500 ms where the gate hears nothing any more),
 where emission is off after 1 s wherever the laser's port still answers, no light ever fell on a mirror at rest, and
 applications that lived ended with code 3 and a line that says why.
+
+    python -m tests.campaigns.devices.guard_kill --kills 0 --others 0 --pairs 60
+
+Pairs are two different blows, the second up to 50 ms after the first. They pass where light is gone after 500 ms, or
+after the longer time that one of the two may take, none fell on a mirror at rest, and no application goes on for ever.
 """
 
 import argparse
 import functools
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -23,6 +29,7 @@ from tests.campaigns.studies import add_options, results_of
 from tests.wire.scans.scan_rig import Applications, ScanFailedError
 from tests.wire.scans.scan_strikes import (
     BY_HAND,
+    NEVER_S,
     OPENING_S,
     SCAN_STRIKES,
     ScanOutcome,
@@ -50,6 +57,24 @@ def blow(name: str, laser: str, share: float) -> dict[str, Any]:
     return {**outcome, "endless": endless}
 
 
+def pair(name: str, then: str, apart_s: float, laser: str, share: float) -> dict[str, Any]:
+    """Two blows as a case, as `blow` gives one."""
+    try:
+        outcome = asdict(strike_scan(applications(), name, laser, share, then=(then, apart_s)))
+    except ScanFailedError as error:
+        return {"failed": str(error)}
+    endless = [key for key, value in outcome.items() if value == math.inf]
+    return {**outcome, "endless": endless}
+
+
+PAIRED = [
+    name
+    for name, made in SCAN_STRIKES.items()
+    if (made.scanner, made.sync) == ("helios", "prawndo") and not made.labours and not made.lasting
+]
+"""Blows to one and the same rig."""
+
+
 def outcome_of(result: dict[str, Any] | None) -> ScanOutcome | str:
     """The outcome in the result of `blow`; what went wrong if there is none."""
     if result is None or "failed" in result:
@@ -61,11 +86,12 @@ def outcome_of(result: dict[str, Any] | None) -> ScanOutcome | str:
 
 def main() -> int:
     """Run the campaign; 1 where a limit was broken."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--others", type=int, default=100, help="blows of each other sort")
     parser.add_argument("--only", nargs="*", choices=[*SCAN_STRIKES], default=[*SCAN_STRIKES])
     parser.add_argument("--lasers", nargs="*", choices=[*OPENING_S], default=["obis", "cobolt"])
+    parser.add_argument("--pairs", type=int, default=0, help="of two blows at once")
     parser.add_argument("--seed", type=int, default=1)
     add_options(parser)
     options = parser.parse_args()
@@ -76,13 +102,55 @@ def main() -> int:
         for name, count in counts.items()
         for i in range(count)
     ]
+    pairs = [
+        {
+            **dict(zip(("name", "then"), map(str, random.choice(PAIRED, 2, replace=False)), strict=True)),
+            "apart_s": float(random.uniform(0.0, 0.05)),
+            "laser": options.lasers[i % len(options.lasers)],
+            "share": float(random.random()),
+        }
+        for i in range(options.pairs)
+    ]
     cases = [Case("tests.campaigns.devices.guard_kill:blow", each, each) for each in blows]
+    cases += [Case("tests.campaigns.devices.guard_kill:pair", each, each) for each in pairs]
     outcomes = [outcome_of(result) for result in results_of(cases, options.workers, options.out)]
-    passed = True
+    passed = not pairs or _report_pairs(pairs, outcomes[len(blows) :])
     for name in counts:
         mine = [i for i, each in enumerate(blows) if each["name"] == name]
         passed &= _report(name, [blows[i]["laser"] for i in mine], [outcomes[i] for i in mine])
     return 0 if passed else 1
+
+
+def _report_pairs(pairs: Sequence[dict[str, Any]], outcomes: Sequence[ScanOutcome | str]) -> bool:
+    """Print what came of pairs of blows; return whether all of them passed."""
+    light_s, wrong, lit = [0.0], 0, 0
+    for drawn, outcome in zip(pairs, outcomes, strict=True):
+        if isinstance(outcome, str):
+            print(f"{drawn['name']}, {drawn['then']}: no blow, {outcome}", flush=True)
+        elif not outcome.over:
+            made = [SCAN_STRIKES[drawn[key]] for key in ("name", "then")]
+            lit += outcome.was_lit
+            light_s.append(outcome.light_s)
+            troubles = [f"{1e3 * outcome.rest_s:.2f} ms of light at rest"] if outcome.rest_s else []
+            longest_s = max(NEVER_S, *(each.light_s for each in made))
+            if outcome.light_s > longest_s:
+                troubles.append(f"light after {1e3 * outcome.light_s:.0f} ms")
+            if all(each.laser_answers for each in made) and outcome.emission_s == math.inf:
+                troubles.append("emission goes on")
+            if outcome.code is None:
+                troubles.append("the application goes on for ever")
+            if "Traceback" in outcome.said:
+                troubles.append("a traceback")
+            if troubles:
+                wrong += 1
+                print(f"{drawn}: {'; '.join(troubles)} ({outcome.said.strip()[-300:]})", flush=True)
+    median_s, most_s = float(np.median(light_s[1:] or 0.0)), max(light_s)
+    print(
+        f"pairs: {len(light_s) - 1} of {len(pairs)} dealt, {lit} while lit; light {1e3 * median_s:.0f} ms (median), "
+        f"{1e3 * most_s:.0f} ms (most); {wrong} wrong",
+        flush=True,
+    )
+    return not wrong
 
 
 def _report(name: str, lasers: list[str], outcomes: list[ScanOutcome | str]) -> bool:

@@ -461,3 +461,5 @@ CLOCKS: tuple[str, ...] = ("clock steps", "clock drifts")
 """Faults that need not be told where they are small: the binding follows a crystal."""
 OUT_OF_ORDER: tuple[str, ...] = ("block doubled", "blocks swapped", *CLOCKS)
 """Faults after which blocks come twice, in another order, or with times that do not go on."""
+UNKNOWN_LOSS: str = "blocks lost"
+"""The fault after which the device's own count of frames does not fit those that came, as `verify` says."""

@@ -6,11 +6,20 @@ import resource
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from drivers.guard import GuardLimits
 from tests.wire.emulated_lasers import eventually
-from tests.wire.scans.scan_rig import CARD_BUFFER_S, PATIENT, STEP_S, Applications, ScanBench, scan_bench
+from tests.wire.scans.scan_rig import (
+    CARD_BUFFER_S,
+    PATIENT,
+    STEP_S,
+    Applications,
+    ScanBench,
+    ScanFailedError,
+    scan_bench,
+)
 
 GONE_S = 0.1
 """Light has to be gone after this, at the 99.9th percentile..."""
@@ -209,9 +218,17 @@ class ScanOutcome:
 
 
 def strike_scan(
-    applications: Applications, name: str, laser: str, share: float, *, measured: bool = True
+    applications: Applications,
+    name: str,
+    laser: str,
+    share: float,
+    *,
+    measured: bool = True,
+    then: tuple[str, float] | None = None,
 ) -> ScanOutcome:
     """Start a scan and strike: share (0 to 1) of the way from its first light, or its start, to beyond its end.
+
+    then: a second blow, of the same devices, and by how many seconds it comes later.
 
     Measured, light and emission are looked at until they have to be gone; else the scan is a long one, and they are
     waited for.
@@ -233,6 +250,10 @@ def strike_scan(
         was_lit = bool(bench.light(at_s - 0.05))
         if not over:
             made.blow(bench)
+            if then is not None:
+                time.sleep(then[1])
+                with suppress(ProcessLookupError, FileNotFoundError, ScanFailedError):  # the first one was its end
+                    SCAN_STRIKES[then[0]].blow(bench)
         if measured:
             time.sleep(made.emission_s + 0.05)
         elif made.laser_answers and laser != BY_HAND:
