@@ -233,7 +233,7 @@ def dated(prefix: str = "") -> Path:
 
 def refusal(error: BaseException) -> str | None:
     """One line about a file or disk to which the system refused access, or about memory; None for every other error."""
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         return f"out of memory: {str(error) or 'there was no more'}; end other programs, or take less at a time"
     if not isinstance(error, OSError) or (error.filename is None and error.errno not in _STEPS):
         return None
@@ -241,6 +241,13 @@ def refusal(error: BaseException) -> str | None:
     path = "the disk" if error.filename is None else os.fsdecode(error.filename)
     return f"cannot use {path}: {error.strerror}; {step}"
 
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Whether an error is for want of memory. OpenCV and threads have errors of their own for it."""
+    return isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY)
+
+
+_NO_MEMORY = "std::bad_alloc", "can't start new thread", "failed to map segment", "Insufficient memory"
 
 _STEPS = {
     errno.EACCES: "ask its owner for permission, or name another path",
@@ -274,7 +281,7 @@ def code_of(error: BaseException) -> int | None:
     from rig.errors import RigError
 
     full = any(isinstance(each, OSError) and each.errno in _FULL for each in (error, error.__cause__))
-    if full or isinstance(error, MemoryError):
+    if full or _lacks_memory(error):
         return EXIT_DEVICE
     if refusal(error):
         return EXIT_USAGE

@@ -294,10 +294,15 @@ def test_with_json_an_error_is_exactly_one_object(rig: Rig, arguments: list[str]
         (DeviceError("laser is gone"), 3, ["laser is gone"]),
         (UsageError("one", "two"), 2, ["one", "two"]),
         (MemoryError(), 3, ["out of memory: there was no more; end other programs, or take less at a time"]),
+        (
+            RuntimeError("can't start new thread"),
+            3,
+            ["out of memory: can't start new thread; end other programs, or take less at a time"],
+        ),
         (KeyboardInterrupt(), 4, ["aborted"]),
         (ZeroDivisionError("by 0"), 70, ["the program failed with ZeroDivisionError: by 0; report it"]),
     ],
-    ids=["device", "usage", "memory", "aborted", "defect"],
+    ids=["device", "usage", "memory", "threads", "aborted", "defect"],
 )
 def test_whatever_ends_a_command_json_says_why(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, raised: BaseException, code: int, problems: list[str]
