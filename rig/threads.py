@@ -9,6 +9,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from queue import SimpleQueue
 from typing import Self
@@ -20,8 +21,29 @@ Work = Callable[[int, int], None]
 _Job = tuple[Work, int, int]
 _LEAST_URGENT = 19
 _LOOK_S = 0.01
+_BEGIN_S = 60.0
 _stages: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 _workers: "weakref.WeakSet[_State]" = weakref.WeakSet()
+
+
+class _Begun(threading.Event):
+    """The event for which `Thread.start` waits. Python waits for ever if a thread finds no memory to begin with."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """As usual; without a timeout raises MemoryError after `_BEGIN_S`."""
+        if super().wait(_BEGIN_S if timeout is None else timeout):
+            return True
+        if timeout is None:
+            raise MemoryError("a thread did not begin")
+        return False
+
+
+class _Thread(threading.Thread):
+    """A thread for which nobody waits when the program ends."""
+
+    def __init__(self, run: Callable[[], None], name: str) -> None:
+        super().__init__(target=run, name=name, daemon=True)
+        self._started = _Begun()
 
 
 class RowWorkers:
@@ -37,7 +59,7 @@ class RowWorkers:
         self._state = _State(self.threads if self.threads > 1 else 0)
         self._ended = weakref.finalize(self, _end, self._state)
         for i, queue in enumerate(self._state.queues):
-            threading.Thread(target=_run, args=(self._state, queue, i), name=f"rows {i}", daemon=True).start()
+            _Thread(partial(_run, self._state, queue, i), f"rows {i}").start()
 
     def over(self, rows: int, work: Work) -> None:
         """Call work(first, last) for ranges that together cover rows 0..rows-1; wait for them and all earlier posts."""
@@ -145,7 +167,7 @@ class StageThread:
     """
 
     def __init__(self, run: Callable[[], None], name: str) -> None:
-        self._thread = threading.Thread(target=run, name=name, daemon=True)
+        self._thread = _Thread(run, name)
 
     def start(self) -> None:
         """Start the thread."""

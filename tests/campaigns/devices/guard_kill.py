@@ -11,7 +11,8 @@ applications that lived ended with code 3 and a line that says why.
     python -m tests.campaigns.devices.guard_kill --kills 0 --others 0 --pairs 60
 
 Pairs are two different blows, the second up to 50 ms after the first. They pass where light is gone after 500 ms, or
-after the longer time that one of the two may take, none fell on a mirror at rest, and no application goes on for ever.
+after the longer time that one of the two may take, and none fell on a mirror at rest. Where guard or application is left,
+emission ends too, and the application does not go on for ever.
 """
 
 import argparse
@@ -73,6 +74,9 @@ PAIRED = [
     if (made.scanner, made.sync) == ("helios", "prawndo") and not made.labours and not made.lasting
 ]
 """Blows to one and the same rig."""
+_GUARD = {"guard killed", "guard stopped"}
+_APPLICATION = {"application killed", "application stopped", "gate's firmware hangs"}
+"""Blows after which no application is left to end emission; without a guard, too, only the gate's own time ends light."""
 
 
 def outcome_of(result: dict[str, Any] | None) -> ScanOutcome | str:
@@ -135,9 +139,11 @@ def _report_pairs(pairs: Sequence[dict[str, Any]], outcomes: Sequence[ScanOutcom
             longest_s = max(NEVER_S, *(each.light_s for each in made))
             if outcome.light_s > longest_s:
                 troubles.append(f"light after {1e3 * outcome.light_s:.0f} ms")
-            if all(each.laser_answers for each in made) and outcome.emission_s == math.inf:
+            both = {drawn["name"], drawn["then"]}
+            left = not (both & _GUARD and both & _APPLICATION)
+            if left and all(each.laser_answers for each in made) and outcome.emission_s == math.inf:
                 troubles.append("emission goes on")
-            if outcome.code is None:
+            if left and outcome.code is None:
                 troubles.append("the application goes on for ever")
             if "Traceback" in outcome.said:
                 troubles.append("a traceback")

@@ -4,6 +4,7 @@ import threading
 
 import pytest
 
+from rig import threads
 from rig.threads import RowWorkers, StageThread, all_at_rest
 
 
@@ -97,6 +98,15 @@ def test_threads_at_work_are_known_until_they_rest():
         assert not all_at_rest(0.0)
         go.set()
         assert all_at_rest(10.0)
+
+
+@pytest.mark.parametrize("start", [StageThread(print, "stage").start, lambda: RowWorkers(2)])
+def test_a_thread_without_memory_to_begin_with_is_not_waited_for(start, monkeypatch):
+    monkeypatch.setattr(threads, "_BEGIN_S", 0.1)
+    monkeypatch.setattr(threading.Thread, "_bootstrap", lambda thread: None)  # dies before it tells that it has begun
+    with pytest.raises(MemoryError, match="did not begin"):
+        start()
+    assert all_at_rest(10.0)
 
 
 _ENDING = """
