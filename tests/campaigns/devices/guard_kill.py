@@ -11,8 +11,8 @@ applications that lived ended with code 3 and a line that says why.
     python -m tests.campaigns.devices.guard_kill --kills 0 --others 0 --pairs 60
 
 Pairs are two different blows, the second up to 50 ms after the first. They pass where light is gone after 500 ms, or
-after the longer time that one of the two may take, and none fell on a mirror at rest. Where guard or application is left,
-emission ends too, and the application does not go on for ever.
+after the longer time that one of the two may take, and none fell on a mirror at rest. Where guard or application is
+left, emission ends too, and the application does not go on for ever.
 """
 
 import argparse
@@ -76,7 +76,7 @@ PAIRED = [
 """Blows to one and the same rig."""
 _GUARD = {"guard killed", "guard stopped"}
 _APPLICATION = {"application killed", "application stopped", "gate's firmware hangs"}
-"""Blows after which no application is left to end emission; without a guard, too, only the gate's own time ends light."""
+"""Blows after which no application is left to end emission; without a guard either, the gate's own time ends light."""
 
 
 def outcome_of(result: dict[str, Any] | None) -> ScanOutcome | str:
