@@ -120,15 +120,19 @@ def run_batch(
         aborted = True
     finally:
         executor.close()
-        there = store.finished()
-        done, total = len(there), len(store.cases)
-        packed = shard[1] == 1 or (done == total and store.alone())
+        total = len(store.cases)
+        there, packed = None, shard[1] == 1
+        if not packed:
+            there = store.finished()
+            packed = len(there) == total and store.alone()
         if packed:
             try:
-                store.pack()
+                there = store.pack()
             except OSError as error:
                 packed = False
                 runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
+        there = store.finished() if there is None else there
+        done = len(there)
     for name in runs.done - there:
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
     failures = tuple(

@@ -176,8 +176,8 @@ class Store:
         """All finished cases, in order."""
         return read_rows(self.folder)
 
-    def pack(self) -> int:
-        """Write the table with all results that there are, and return their number. Raises OSError."""
+    def pack(self) -> set[str]:
+        """Write the table with all results that there are, and return the names of their cases. Raises OSError."""
         rows = list(self.rows())
         table = [json_line(self.head)]
         table += [json_line({CASE: row.case, "labels": row.labels, RESULT: row.result}) for row in rows]
@@ -192,7 +192,7 @@ class Store:
                     file.unlink(missing_ok=True)
         if len(packed) == len(self.cases):
             shutil.rmtree(self.folder / CASES, ignore_errors=True)
-        return len(packed)
+        return packed
 
     def alone(self) -> bool:
         """Whether no other shard is at work in the folder; none can begin then until `close`."""
