@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drivers.errors import ProtocolError
 from drivers.frames import FrameBlock, Mark
 from rig.count.bind import BoundFrames, FrameBinder, SweepClock
+from rig.count.sweep_watch import SweepWatch
 from rig.count.volume import BIN_UNUSABLE, Counter, FrameTally
 from rig.geometry.windows import WORD_PX
 from rig.plan.scan_plan import ScanPlan
@@ -87,11 +88,12 @@ class FirstSweep:
 
 class SweepAssembler:
     """Turns the blocks of one start into `maps` sweeps, from `start` (None: sweep 0) on. The result does not depend on
-    how frames are grouped into blocks."""
+    how frames are grouped into blocks. gate_delay_s: of the light after the gate, as far as it is known."""
 
     def __init__(
-        self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: FirstSweep | None = None
-    ) -> None:
+        self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: FirstSweep | None = None,
+        gate_delay_s: float = 0.0,
+    ) -> None:  # fmt: skip
         from rig.count.bind_kernels import cover
 
         self._plan = plan
@@ -103,6 +105,7 @@ class SweepAssembler:
         self._first_index = first_index
         self._start = start or FirstSweep()
         self._binder = FrameBinder(plan, self._start.clock_ratio, self._start.sweep, self._start.sweep + maps)
+        self._watch = _sweep_watch(plan, gate_delay_s)
         self._adds: deque[int] = deque(maxlen=MOST_UNDER_WAY)
         self._next_frame: int | None = None
         self._last_tick: int | None = None
@@ -154,6 +157,12 @@ class SweepAssembler:
                 self._lit += lit
                 self._dark += dark
                 self._counter.add(block.bits[a:b], bins, bound.column[a:b], x0[a:b])
+                column, leg = bound.column[a:b], self._plan.leg(number)
+                done = column + 0.5 if leg.columns_rise else self._plan.places - 0.5 - column
+                self._watch.add(
+                    block.bits[a:b], block.frame_numbers[a:b], bins >= 0, x0[a:b], done * self._plan.exposures,
+                    block.records["marks"][a:b], number % len(self._plan.legs),
+                )  # fmt: skip
                 self._adds[-1] += 1
             self._count_s += spent.seconds
 
@@ -173,7 +182,9 @@ class SweepAssembler:
         self._gaps = [gap for gap in self._gaps if gap[1] >= clock.end_frame]
         direction = self._plan.leg(clock.sweep).direction
         with self.time.charge() as spent:
-            tally = replace(self._counter.finish(), velocity_per_s=self._plan.velocity_per_s(direction))
+            doubts = self._watch.finish(clock.sweep % len(self._plan.legs))
+            tally = self._counter.finish()
+            tally = replace(tally, velocity_per_s=self._plan.velocity_per_s(direction), doubts=doubts)
         self._count_s += spent.seconds
         data = SweepData(
             index=self._first_index + clock.sweep - self._start.sweep,
@@ -251,6 +262,20 @@ class SweepAssembler:
                 "that should come next; start anew"
             )
         self._run_id, self._width = header.run_id, header.width
+
+
+def _sweep_watch(plan: ScanPlan, gate_delay_s: float) -> SweepWatch:
+    """The watch over a plan's frames. Where the light itself tells of columns, it cannot be late."""
+    rate = float(plan.frame_rate_hz)
+    gate = [
+        ((leg.gate_open_s - start_s) * rate, (leg.gate_close_s - start_s) * rate)
+        for leg in plan.legs
+        for start_s in (plan.lit_start_s(leg),)
+    ]
+    frames = plan.places * plan.exposures
+    by_markers = gate if plan.blanking is None else ()
+    late, exposed = gate_delay_s * rate, plan.exposure_s * rate
+    return SweepWatch(plan.exposures, frames, by_markers, delay=late, exposed=exposed, whole=not plan.windowed)
 
 
 def _warn(sweep: SweepData) -> None:

@@ -73,7 +73,8 @@ class FrameTally:
     n_frames: (columns,), frames in each column's bin. column: (columns,), mean fractional column of those frames, NaN
     if there are none. dark_counts: (rows, width), ones over n_dark frames with the gate low, None if there are none.
     width: of the sensor, pixels. dark_frames: (width,), number of the n_dark frames in which a pixel was used; None: in
-    all of them. velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown.
+    all of them. velocity_per_s: of the mirror command over the columns, negative if it fell, 0 if unknown. doubts: of
+    the frames' order and time (`rig.count.sweep_watch`).
     """
 
     n_frames: NDArray[np.int32]
@@ -83,6 +84,7 @@ class FrameTally:
     width: int
     dark_frames: NDArray[np.int32] | None = None
     velocity_per_s: float = 0.0
+    doubts: tuple[str, ...] = ()
 
     def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
         """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts. workers: threads

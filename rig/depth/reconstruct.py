@@ -33,7 +33,8 @@ class MapResult:
     depth_m, confidence, depth_sd_m: float32 (rows, width), as in `rig.depth.depth.DepthMap`: NaN, 0 and NaN where there
     is no depth, which is everywhere without a calibration.
     compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
-    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`). floating:
+    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`) and frames
+    (`rig.count.sweep_watch`). floating:
     number of points left out because they float between two surfaces; None if such points are kept, or without depth.
     """
 
@@ -207,6 +208,7 @@ class Reconstructor:
             )
         fog, intensity = self._fog(sweep, stripe, used), sweep.intensity(workers)
         doubts, stripe = self._checks.check(sweep, intensity, stripe)
+        doubts = (*sweep.doubts, *doubts)
         if self._lines is not None:
             stripe = share_claims(stripe, self._lines)
         if filter == "median":

@@ -18,12 +18,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
-from calibration.files.rig_file import CALIBRATION_FILE
+import numpy as np
+from numpy.typing import NDArray
+
+from calibration.errors import CalibrationError
+from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from calibration.model.rig_model import Identity, RigModel
 from drivers.json_text import parse_json
 from drivers.replay.spad import ReplaySpad
 from rig.devices.open import OpenRig
 from rig.errors import UsageError
+from rig.recording.inputs import read_plan
 from rig.run_folder.disk import replace_file
 from rig.run_folder.manifest import read_manifest
 
@@ -36,7 +41,7 @@ NEXT: Final = "calibrate again, or add `accept_calibration=True` to use it all t
 class Refusal:
     """One reason not to use a calibration, for a rig or for a camera alone.
 
-    code: other-spad, other-scanner, other-world, other-lines, failed-verdict, failed-check or too-old.
+    code: other-spad, other-scanner, other-world, other-lines, other-depth, failed-verdict, failed-check or too-old.
     """
 
     code: str
@@ -48,6 +53,10 @@ class Refusal:
 
 
 DAY_S: Final = 86400.0
+SAME_DEPTH: Final = 0.01
+"""Largest relative difference between the depths of two calibrations that count as the same."""
+COMPARED_PX: Final = 24
+"""Rows, columns of pixels and mirror commands at which two calibrations are compared, of each."""
 _SLOTS: Final = ("spad", "scanner")
 """Devices that depth depends on: laser and sync source only let the light out."""
 _NO_SERIAL: Final = ("", "none")
@@ -141,7 +150,7 @@ def calibration_use(rig: OpenRig, *, accept: bool = False, here: Identity | None
     if rig.model is None:
         return None
     here = here or identity_of(rig)
-    found = refusals(rig.model, rig.config.calibration, here, rig.config.calibration_max_age)
+    found = refusals(rig.model, rig.config.calibration, here, rig.config.calibration_max_age) + _other_depth(rig)
     return _used(rig.model, rig.config.calibration, found, accept, _accepted_before(rig))
 
 
@@ -217,6 +226,53 @@ def _aged(made: Identity, here: Identity, max_age_s: float | None) -> list[Refus
         return []
     said = f"was made {_span(age_s)} ago ({made.created}), calibration_max_age is {_span(max_age_s)}"
     return [Refusal("too-old", said)]
+
+
+def _other_depth(rig: OpenRig) -> tuple[Refusal, ...]:
+    """A reason if a calibration that does not state its rig gives other depths than the one with which the played
+    recording was taken. One that states the rig may be better, and differ for that reason."""
+    file, model = rig.config.calibration, rig.model
+    if not isinstance(rig.spad, ReplaySpad) or model is None or model.identity is not None or file is None:
+        return ()
+    run = rig.spad.recording.path
+    before = run / CALIBRATION_FILE
+    if file.resolve() == before.resolve() or not before.exists():
+        return ()
+    try:
+        plan, own = read_plan(run), load_rig_model(before)
+        ratio = _depth_ratio(own, model, plan.commands, plan.depth_range_m)
+    except (CalibrationError, UsageError):
+        return ()  # nothing to compare with; what cannot be used is refused elsewhere
+    if abs(ratio - 1) <= SAME_DEPTH:
+        return ()
+    times = f"its depths are {ratio:.3g} times those of the calibration with which {run} was taken"
+    said = f"does not state its rig, and {times}"
+    return (Refusal("other-depth", said),)
+
+
+def _depth_ratio(
+    own: RigModel, other: RigModel, commands: NDArray[np.float64], depth_range_m: tuple[float, float]
+) -> float:
+    """Depth by another calibration over that by a recording's own: the pixel and column at which it differs by more
+    than at half of all, within the depth range. Negative where the other one has surfaces behind the camera."""
+    shape = own.camera.height, own.camera.width
+    rows, columns = (np.linspace(0, n - 1, COMPARED_PX).astype(np.int64) for n in shape)
+    chosen = np.ix_(rows, columns)
+    some = commands[np.linspace(0, len(commands) - 1, COMPARED_PX).astype(np.int64)]
+
+    def inverse(model: RigModel) -> NDArray[np.float64]:
+        across, down = (each[chosen].ravel() for each in model.camera.tangents())
+        nx, ny, nz, d = model.planes(some).T[:, :, None]
+        return np.asarray((nx * across + ny * down + nz) / d)
+
+    mine, theirs = inverse(own), inverse(other)
+    near, far = depth_range_m
+    inside = (mine >= 1 / far) & (mine <= 1 / near) & np.isfinite(theirs)
+    if not inside.any():
+        return 1.0
+    differs = theirs[inside] / mine[inside]
+    middle = differs[np.argsort(np.abs(differs - 1))[len(differs) // 2]]
+    return float(1 / middle) if middle else np.inf
 
 
 def _span(time_s: float) -> str:

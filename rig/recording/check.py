@@ -46,6 +46,7 @@ _FEW: Final = 4
 FRAMES_SEAL: Final = "payloads_crc32"
 """Key of the manifest's section `recording`."""
 _CRC: Final = struct.Struct("<I")
+_NOT_ITS_OWN: Final = "bring its own segments back, or let 'rig repair' take it as it is"
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,7 +356,8 @@ def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> st
 
 
 def require_own_frames(recording: RunRecording) -> None:
-    """Raise DamagedRecordingError if the frames of a recording are not those of its manifest's seal.
+    """Raise DamagedRecordingError if the frames of a recording are not those of its manifest's seal, or in more or
+    fewer blocks than it says although no frame is missing.
 
     Reads the trailers of its blocks, not their pixels. Compressed ones would have to be unpacked for that, so only `rig
     verify` looks at theirs.
@@ -363,11 +365,41 @@ def require_own_frames(recording: RunRecording) -> None:
     manifest = read_manifest(recording.path) if recording.path.is_dir() else None
     if manifest is None:
         return
+    if (problem := _other_blocks(recording, manifest)) is not None:
+        raise DamagedRecordingError(f"{recording.path}: {problem}; {_NOT_ITS_OWN}")
     try:
         crcs = recording.payload_crcs()
     except CorruptBlock:
         return  # reading it says what is wrong
     if crcs is not None and (problem := seal_problem(crcs, manifest)) is not None:
-        raise DamagedRecordingError(
-            f"{recording.path}: {problem}; bring its own segments back, or let 'rig repair' take it as it is"
-        )
+        raise DamagedRecordingError(f"{recording.path}: {problem}; {_NOT_ITS_OWN}")
+
+
+def _other_blocks(recording: RunRecording, manifest: Mapping[str, Any]) -> str | None:
+    """A line if a recording of a finished run has more blocks or frames than that had, or fewer blocks of as many
+    frames; None if not."""
+    told, delivered = _told(manifest)
+    if told is None:
+        return None
+    blocks, frames = sum(len(run.entries) for run in recording.runs), recording.frames
+    if blocks > told or (delivered is not None and (frames > delivered or (frames == delivered and blocks < told))):
+        of_frames = "" if delivered is None else f" with {delivered} frames"
+        return f"there are {blocks} blocks with {frames} frames, the run recorded {told} blocks{of_frames}"
+    return None
+
+
+def frames_never_told(recording: RunRecording, manifest: Mapping[str, Any]) -> int:
+    """Number of frames that a finished run recorded, in blocks of which neither index nor segments tell."""
+    told, delivered = _told(manifest)
+    if told is None or delivered is None or recording.problems or "cut" in manifest:
+        return 0
+    fewer = sum(len(run.entries) for run in recording.runs) < told
+    return max(0, delivered - recording.frames) if fewer else 0
+
+
+def _told(manifest: Mapping[str, Any]) -> tuple[int | None, int | None]:
+    """Blocks that a finished run recorded and frames that its SPAD delivered, by its manifest; None if unknown."""
+    blocks = (manifest.get("recording") or {}).get("blocks")
+    if not isinstance(blocks, int) or manifest.get("verdict") == UNFINISHED or ended_early(manifest) is not None:
+        return None, None
+    return blocks, None if "cut" in manifest else device_counters(manifest)[0].get("delivered")

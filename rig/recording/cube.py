@@ -10,7 +10,7 @@ import os
 import tokenize
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,7 @@ from calibration.model.rig_model import RigModel
 from calibration.model.scanner import PlaneTable
 from drivers.recorded import RecordedRun, RunRecording
 from rig.config.models import CubePlan
+from rig.count.sweep_watch import SweepWatch
 from rig.count.sweeps import Gap
 from rig.count.volume import Counter, FrameTally
 from rig.errors import UsageError
@@ -115,6 +116,7 @@ def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, lis
     last_byte = np.uint8(0xFF << (-cube.width % 8) & 0xFF)
     gaps: list[Gap] = []
     following = first
+    watch = SweepWatch(cube.plan.exposures, cube.frames_per_map)
     for start, piece in cube.between(first, end, step):
         if start > following:
             gaps.append((following, start - 1))
@@ -123,11 +125,14 @@ def count_map(cube: Cube, index: int, counter: Counter) -> tuple[FrameTally, lis
         bits[:, :, :row_bytes] = piece[:, :, :row_bytes]
         bits[:, :, row_bytes - 1] &= last_byte
         column = (np.arange(start - first, following - first) // cube.plan.exposures).astype(np.int32)
-        counter.add(bits, column, column.astype(np.float64), np.zeros(len(bits), np.int32))
+        x0 = np.zeros(len(bits), np.int32)
+        counter.add(bits, column, column.astype(np.float64), x0)
+        watch.add(bits, np.arange(start, following), np.ones(len(bits), np.bool_), x0)
         counter.settle(1)  # limits the frames that wait in memory
     if following < end:
         gaps.append((following, end - 1))
-    return counter.finish(), gaps
+    tally = counter.finish()
+    return replace(tally, doubts=watch.finish()), gaps
 
 
 def _array_problems(file: Path, array: NDArray[Any], plan: CubePlan, camera: Camera) -> list[str]:

@@ -31,7 +31,7 @@ from rig.estimate.registry import LEARNING, Learned
 from rig.estimate.row.model import RowModel
 from rig.plan.compile import spad_request
 from rig.plan.scan_plan import ScanPlan
-from rig.recording.check import merged_gaps
+from rig.recording.check import frames_never_told, merged_gaps
 from rig.recording.inputs import LEARNED_FILE, PLAN_FILE, read_plan
 from rig.recording.open import begins_sweep, fitted_ratio, markers_seen, require_recording
 from rig.requests import ReplayRequest
@@ -336,6 +336,9 @@ def _end_gaps(recording: RunRecording, manifest: dict[str, Any]) -> list[RunGap]
         first, end = _readable_range(recording, run)
         gaps += [(run.number, run.first_frame, first - 1)] if first > run.first_frame else []
         gaps += [(run.number, end, run.end_frame - 1)] if end < run.end_frame else []
+    last = recording.runs[-1]
+    if not gaps and (left := frames_never_told(recording, manifest)):
+        gaps.append((last.number, last.end_frame, last.end_frame + left - 1))
     return sorted(gaps)
 
 

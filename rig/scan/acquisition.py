@@ -135,7 +135,8 @@ class Acquisition:
         done = 0
         while done < self._asked.maps:
             sweeps, begin = self._next_start(self._asked.maps - done)
-            assembler = SweepAssembler(plan, counter, sweeps, done, begin)
+            delay_s = 0.0 if self._rig.model is None else self._rig.model.gate_delay_s
+            assembler = SweepAssembler(plan, counter, sweeps, done, begin, delay_s)
             counter.reset()
             yield from self._run_start(assembler, sweeps, done)
             done += sweeps

@@ -169,6 +169,18 @@ def focal_length_off(setting: Setting) -> Wrong:
     return _of_calibration(setting, f"focal length x {factor}", changed(setting.geometry, focal=factor))
 
 
+def baseline_off_before(setting: Setting) -> Wrong:
+    """A rig whose baseline is not that of its calibration, which was wrong before the recording was taken."""
+    factor = float(setting.rng.choice([0.97, 1.03]))
+    return _of_world(setting, f"baseline x {factor}", changed(setting.geometry, baseline=factor))
+
+
+def focal_length_off_before(setting: Setting) -> Wrong:
+    """A rig whose focal length is not that of its calibration, which was wrong before the recording was taken."""
+    factor = float(setting.rng.choice([0.98, 1.02]))
+    return _of_world(setting, f"focal length x {factor}", changed(setting.geometry, focal=factor))
+
+
 def mirror_reversed(setting: Setting) -> Wrong:
     """The mirror turns the other way than its calibration says, since two wires are swapped."""
     return _of_world(setting, "mirror x -1", changed(setting.geometry, mirror=-1.0))
@@ -368,6 +380,8 @@ CASES: Mapping[str, Case] = {
     "another rig's calibration": Case(other_calibration),
     "baseline 3 % off": Case(baseline_off),
     "focal length 2 % off": Case(focal_length_off),
+    "baseline 3 % off before the run": Case(baseline_off_before),
+    "focal length 2 % off before the run": Case(focal_length_off_before),
     "mirror the other way": Case(mirror_reversed),
     "markers of the wrong edge": Case(wrong_edge),
     "two recordings' segments mixed": Case(segments_mixed),

@@ -48,9 +48,27 @@ def test_a_recording_can_be_reconstructed_otherwise(rig: Rig, small: Path) -> No
     Path("nearer.yaml").write_text(yaml.safe_dump(nearer))
     assert rig("reconstruct", "run", "--calibration", "run/calibration.yaml", "--out", "same").code == 0
     assert_same(Path("run"), Path("same"))
-    assert rig("reconstruct", "run", "--calibration", "nearer.yaml", "--out", "near").code == 0
+    arguments = ("reconstruct", "run", "--calibration", "nearer.yaml", "--out", "near")
+    refused = rig(*arguments)
+    assert (refused.code, "its depths are 0.5 times those of the calibration with which" in refused.err) == (2, True)
+    assert rig(*arguments, "--accept-calibration").code == 0
     depth, near = (np.load(f"{name}/depth/000000.npy") for name in ("run", "near"))
     assert np.nanmedian(near) == pytest.approx(np.nanmedian(depth) / 2, rel=0.1)
+
+
+def test_segments_of_another_recording_in_more_or_fewer_blocks_are_said(rig: Rig, small: Path) -> None:
+    for name, maps in (("short", 1), ("long", 6)):
+        assert rig("scan", small, "--maps", maps, "--seed", maps, "--record", "--out", name).code == 0
+        shutil.copytree(name, f"{name} as it was")
+    for mine, other in (("short", "long"), ("long", "short")):
+        for name in ("frames-000000.spb", "frames.idx"):
+            shutil.copy(f"{other} as it was/{name}", f"{mine}/{name}")
+    refused = rig("reconstruct", "short", "--out", "depth")
+    assert (refused.code, "bring its own segments back" in refused.err) == (1, True), refused.err
+    assert "the run recorded" in refused.err
+    assert not Path("depth").exists()
+    assert rig("reconstruct", "long", "--out", "depth").code == 1
+    assert summary(Path("depth"))["verdict"] == "gaps"
 
 
 def test_the_folder_of_a_recording_says_what_it_is_before_the_first_frame(

@@ -27,7 +27,8 @@ from rig.devices.calibration_use import (
 from rig.devices.doctor import examine
 from rig.devices.open import open_rig
 from rig.errors import UsageError
-from tests.system.small_rig import config, write_rig
+from tests.campaigns.wrong_inputs.setting import changed, write_yaml
+from tests.system.small_rig import calibration, config, write_rig
 
 pytestmark = pytest.mark.slow
 
@@ -234,6 +235,42 @@ def test_a_recording_is_compared_with_the_devices_and_the_date_it_was_taken_with
             call(tmp_path / "run", **options)
     accepted = api.reconstruct(tmp_path / "run", accept_calibration=True, **options)
     assert accepted.summary.accepted_calibration[0].startswith("other-spad: ")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"baseline": 1.03}, "1.03"),
+        ({"baseline": 0.97}, "0.97"),
+        ({"focal": 1.02}, "0.98[0-9]*"),
+        ({"right_px": 2.0}, "[0-9.]*"),
+        ({"mirror": -1.0}, "-?[0-9.]*"),
+    ],
+    ids=str,
+)
+def test_a_recording_s_depths_by_a_calibration_that_does_not_state_its_rig_are_compared(
+    tmp_path: Path, change: dict[str, float], says: str
+) -> None:
+    api.scan(write_rig(tmp_path, small()), record=True, out=tmp_path / "run")
+    wrong = tmp_path / "wrong.yaml"
+    write_yaml(wrong, changed(calibration(), **change))
+    for call in (api.reconstruct, api.replay):
+        with pytest.raises(UsageError, match=f"its depths are {says} times those of the calibration with "):
+            call(tmp_path / "run", calibration=wrong, out=tmp_path / "depth")
+    result = api.reconstruct(tmp_path / "run", calibration=wrong, accept_calibration=True, out=tmp_path / "depth")
+    assert [line.split(":")[0] for line in result.summary.as_json()["accepted_calibration"]] == ["other-depth"]
+
+
+def test_a_calibration_of_the_same_depths_or_one_that_states_the_rig_is_used(tmp_path: Path) -> None:
+    rig = calibrated(tmp_path)
+    api.scan(rig, record=True, out=tmp_path / "run")
+    near, stated = tmp_path / "near.yaml", tmp_path / "stated.yaml"
+    write_yaml(near, changed(calibration(), baseline=1.003))
+    write_yaml(stated, changed(calibration(), baseline=1.03))
+    made = load_rig_model(tmp_path / "made.yaml")
+    save_rig_model(replace(load_rig_model(stated), identity=made.identity), stated)
+    for file in (near, stated):
+        api.reconstruct(tmp_path / "run", calibration=file)
 
 
 def test_what_a_recording_s_own_calibration_was_accepted_in_spite_of_stays_accepted(tmp_path: Path) -> None:
