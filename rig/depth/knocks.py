@@ -49,13 +49,16 @@ class KnockWatch:
     def checked(self, result: MapResult) -> MapResult:
         """The next map, with a doubt more if all stripes have moved alike since the one before it."""
         before, self._before = self._before, result.stripe
-        if before is None or self._geometry is None:
+        if before is None or self._geometry is None or not knocked(before, result.stripe, self._geometry):
             return result
-        columns = self._geometry.columns
-        for part in (slice(0, columns // 3), slice(columns - columns // 3, columns)):
-            if _moved_px(before, result.stripe, self._geometry, part) is not None:
-                return replace(result, doubts=(*result.doubts, KNOCKED))
-        return result
+        return replace(result, doubts=(*result.doubts, KNOCKED))
+
+
+def knocked(before: StripeTable, after: StripeTable, geometry: SweepGeometry) -> bool:
+    """Whether all stripes of a map, or of a third of it, have moved alike since the map before it."""
+    columns = geometry.columns
+    parts = slice(0, columns // 3), slice(columns - columns // 3, columns)
+    return any(_moved_px(before, after, geometry, part) is not None for part in parts)
 
 
 def _moved_px(before: StripeTable, after: StripeTable, geometry: SweepGeometry, part: slice) -> float | None:

@@ -57,6 +57,14 @@ def join_runs(parts: Sequence[Path], folder: RunFolder) -> tuple[Summary, dict[s
     return _summary(summaries, whole), _manifest(manifests)
 
 
+def with_doubt(summary: Summary, reason: str, maps: Sequence[int]) -> Summary:
+    """The summary with a doubt more about some maps, by their numbers."""
+    doubts = {doubt.reason: doubt.maps for doubt in summary.verdict_reasons}
+    doubts[reason] = tuple(sorted({*doubts.get(reason, ()), *maps}))
+    verdict = next(each for each in GRAVEST if each in (summary.verdict, RunVerdict.DOUBTFUL))
+    return replace(summary, verdict=verdict, verdict_reasons=tuple(Doubt(*each) for each in doubts.items()))
+
+
 class _OfMaps:
     """Figures of single maps, from their files."""
 

@@ -4,10 +4,13 @@ import filecmp
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rig import api
+from rig.depth.knocks import KNOCKED
 from rig.errors import UsageError
+from rig.run_folder.manifest import RunVerdict
 
 MAPS = 5
 FIGURES = ("maps", "frames", "valid_fraction", "floating_points", "fog", "truth", "verdict", "sync", "time")
@@ -49,3 +52,23 @@ def test_what_needs_the_map_before_is_refused_with_the_reason(recording, tmp_pat
     with pytest.raises(UsageError, match=r"likelihood learns .*, and the scan has kept the states of joint"):
         api.reconstruct_parts(recording, request=request)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_knock_between_two_parts_is_doubted(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.api.studies.parts.MAPS_OF_A_PART", 2)
+    compared = []
+
+    def all_but_the_first(before, after, geometry):
+        compared.append((before.x_px, after.x_px, geometry.columns))
+        return len(compared) > 1
+
+    monkeypatch.setattr("rig.api.studies.parts.knocked", all_but_the_first)
+    result = api.reconstruct_parts(recording, request=api.ReconstructRequest(out=tmp_path / "parts"), workers=2)
+    stripes = [np.load(file)["x_px"] for file in sorted((tmp_path / "parts" / "stripe").iterdir())]
+    for (before, after, columns), seam in zip(compared, (2, 4), strict=True):
+        assert np.array_equal(before, stripes[seam - 1], equal_nan=True)
+        assert np.array_equal(after, stripes[seam], equal_nan=True)
+        assert columns == before.shape[1]
+    assert result.summary.verdict == RunVerdict.DOUBTFUL
+    assert {doubt.reason: doubt.maps for doubt in result.summary.verdict_reasons} == {KNOCKED: (4,)}
+    assert json.loads((tmp_path / "parts" / "manifest.json").read_text())["verdict"] == "doubtful"

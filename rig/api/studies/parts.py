@@ -2,11 +2,13 @@
 
 import shutil
 import tempfile
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from calibration.errors import CalibrationError
+from calibration.files.npy_files import load_arrays
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from rig.api.scans import replay
 from rig.api.studies.batches import executor_of
@@ -17,14 +19,19 @@ from rig.batch.store import Store
 from rig.batch.task import FILES
 from rig.config.models import AUTO
 from rig.config.overrides import PathLike
+from rig.depth.knocks import KNOCKED, knocked
+from rig.depth.reconstruct import map_geometry
 from rig.errors import RigError, UsageError
 from rig.estimate.registry import LEARNING
+from rig.geometry.stripe_table import StripeTable
+from rig.plan.calibration_reach import recalibrated
 from rig.progress import Progress
 from rig.recording.cut import cut
+from rig.recording.inputs import read_plan
 from rig.recording.open import map_spans, open_recording
 from rig.requests import BatchRequest, ReconstructRequest
 from rig.run_folder.folder import RunFolder
-from rig.run_folder.joined import join_runs
+from rig.run_folder.joined import join_runs, with_doubt
 from rig.run_folder.manifest import read_manifest
 from rig.scan.run import RunResult, versions
 
@@ -49,9 +56,6 @@ def reconstruct_parts(
 ) -> RunResult:
     """Make the depth maps of a recording by parts (`rig reconstruct --cluster`). The maps are those of `reconstruct`,
     bit for bit, and are in the request's `out`; the result holds none of them.
-
-    A map is not compared with the last one of the part before it, so that a knock of the rig between these two is not
-    doubted, as it would be in one go (`rig.depth.knocks`).
 
     An estimator that learns needs the states that the recording's own scan has kept for each map. So it must be the
     estimator of the scan, with the same calibration. An interrupted reconstruction goes on where it stopped: what is
@@ -88,6 +92,9 @@ def reconstruct_parts(
                 said = done.reason or f"maps {done.failures[0].labels['maps']}: {done.failures[0].message}"
                 raise RigError(f"{len(done.failures)} of {done.total} parts failed; {said}")
             summary, manifest = join_runs([place / FILES / name for name in store.names], target)
+        seams = range(MAPS_OF_A_PART, maps, MAPS_OF_A_PART)
+        if moved := _knocked_at(seams, target, folder, file or str(folder / CALIBRATION_FILE)):
+            summary = with_doubt(summary, KNOCKED, moved)
         config = {**manifest["config"], "name": f"replay of {folder.name}"}
         config["spad"] = {**config["spad"], "recording": str(folder.absolute())}
         config["calibration"] = file or str(folder.absolute() / CALIBRATION_FILE)
@@ -108,6 +115,25 @@ def reconstruct_part(
         cut(recording, part, maps=f"{first}:{end}")
         result = replay(part, clock="max", calibration=calibration, out=keep, **options).uninterrupted()
     return {"maps": result.summary.maps, "verdict": result.summary.verdict.value, "fog": asdict(result.summary.fog)}
+
+
+def _knocked_at(seams: Iterable[int], target: RunFolder, recording: Path, calibration: PathLike) -> list[int]:
+    """Those of the maps, each the first of a part, before which the rig was knocked since the last map before it.
+
+    Each part compares its own maps.
+    """
+    if not Path(calibration).exists():
+        return []
+    model = load_rig_model(calibration)
+    plan = recalibrated(read_plan(recording), model)
+    geometry = map_geometry(model, plan.commands, plan.depth_range_m, lines=plan.lines)
+    found = []
+    for seam in seams:
+        files = (target.place("stripe") / f"{index:06d}.npz" for index in (seam - 1, seam))
+        before, after = (StripeTable(**load_arrays(file)) for file in files)
+        if knocked(before, after, geometry):
+            found.append(seam)
+    return found
 
 
 def _require_parts(folder: Path, calibration: PathLike | None, request: ReconstructRequest) -> int:
