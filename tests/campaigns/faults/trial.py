@@ -129,7 +129,7 @@ def _trial(rng: np.random.Generator, only: list[str]) -> dict[str, Any]:
         if rng.random() < 0.3 or {"SPAD unplugged", "no memory"} & set(names):
             again = out.parent / "again"
             _scan(base, number, False, again, None, wrong)
-            if not _same(maps_of(again), base.maps):
+            if not same_maps(maps_of(again), base.maps):
                 wrong.append("the scan after it is not the undisturbed one")
     return {
         "faults": sorted(one.name for one in came), "estimator": estimator, "records": records, "end": end,
@@ -155,7 +155,7 @@ def _scan(
         if any(not line and not isinstance(error, MemoryError) for line in said):
             wrong.append(f"an error without a word: {error!r}")
         summary = out / "summary.json"
-        return type(error).__name__, _json(summary)["verdict"] if summary.exists() else None, " | ".join(said)
+        return type(error).__name__, verdict_in(out) if summary.exists() else None, " | ".join(said)
     except Exception as error:
         wrong.append(f"foreign: {type(error).__name__}: {error}")
         return "foreign", None, str(error)
@@ -172,7 +172,7 @@ def _judged(
         wrong.append(f"maps {lost} were complete and are lost")
     same = changed = silent_inside = 0
     for index, (found, usual) in enumerate(zip(maps, base.maps, strict=False)):
-        if _same([found], [usual]):
+        if same_maps([found], [usual]):
             same += 1
             continue
         changed += 1
@@ -257,7 +257,7 @@ def _judge_recording(
         if found != watched.published[: len(found)]:
             wrong.append("blocks of the recording are not those that were published")
     if again is not None and not (odd and not sound):
-        if not _same(maps_of(out.parent / "reconstructed"), maps):
+        if not same_maps(maps_of(out.parent / "reconstructed"), maps):
             wrong.append(f"its recording gives other maps (the scan {verdict}, the recording {again.verdict})")
         if verdict != _FULL_VERDICT and str(again.verdict) == _FULL_VERDICT:
             wrong.append(f"the scan was {verdict}, its recording is complete")
@@ -307,7 +307,8 @@ def maps_of(folder: Path) -> Maps:
     return found
 
 
-def _same(found: Maps, usual: Maps) -> bool:
+def same_maps(found: Maps, usual: Maps) -> bool:
+    """Whether all maps are the same, bit for bit."""
     return len(found) == len(usual) and all(
         a.keys() == b.keys()
         and all(np.array_equal(a[name], b[name], equal_nan=a[name].dtype.kind == "f") for name in a)
@@ -330,6 +331,11 @@ def _left(handles: int) -> Iterator[str]:
         time.sleep(0.01)
     if (now := _handles()) > handles:
         yield f"{now - handles} file handles are left"
+
+
+def verdict_in(run: Path) -> str:
+    """The verdict in the summary of a run."""
+    return str(_json(run / "summary.json")["verdict"])
 
 
 def _json(file: Path) -> Any:
