@@ -63,6 +63,9 @@ MOST_FIRST: Final = 48
 LEAST_SLOW: Final = 0.6
 """Least light that frames have in common with the next but one, relative to the next one: otherwise the line moves so
 fast that it may jump at the edge of a surface."""
+LEAST_COMMON: Final = 4.0
+"""Least number of ones in common with the next frame, summed over the frames before a seam: they might have no light by
+chance."""
 LAGS: Final = 4
 """Most frames by which those that are compared lie apart."""
 MOST_TORN: Final = 0.3
@@ -188,15 +191,16 @@ class SweepWatch:
         n, have = self._begin if self._wanted is not None else 0, np.flatnonzero(self._have)
         if n <= self._exposures or self._exposures < 2 or not self._have[:n].all() or np.ptp(self._x0[:n]):
             return ()
-        begin, usable = self._kept[:n], ~_often_on(self._kept, have)
+        begin, usable = self._kept[:n], ~_often_on(self._kept, have[n:])
         common = [_ones(begin[:-lag] & begin[lag:] & usable) for lag in range(1, LAGS + 1)]
-        far = self._kept[have[len(have) // 2]]
-        usual = float(_ones(begin & far & usable).mean())  # of what stands still, and of chance
+        # Of what stands still, and of chance. Something may shine on a part of the sweep.
+        far = self._kept[have[[len(have) // 3, len(have) // 2, 2 * len(have) // 3]]] & usable
+        usual = min(float(_ones(begin & each).mean()) for each in far)
         found = []
         for seam in range(1 + max(math.ceil(self._delay), 0), self._exposures):
             after = [of_lag[seam:] - usual for of_lag in common]
             slow = [len(right) > 1 and right.mean() >= LEAST_SLOW * after[0].mean() for right in after]
-            if not slow[1]:
+            if not slow[1] or seam * after[0].mean() < LEAST_COMMON:
                 continue
             across = variance = expected = 0.0
             for lag in np.flatnonzero(slow).tolist():
