@@ -27,7 +27,7 @@ from drivers.spb1 import BlockLayout
 from rig.errors import RecordingError
 from rig.recording.check import FRAMES_SEAL, sealed
 from rig.recording.segment import OpenSegment, Staging, paged
-from rig.run_folder.disk import hold, sync_folder
+from rig.run_folder.disk import CLAIM_FILE, hold, sync_folder
 from rig.threads import StageThread
 
 SEGMENT_BYTES: Final = 1 << 30
@@ -38,7 +38,7 @@ _SYNC_EVERY_S: Final = SYNC_INTERVAL_S / 2
 """Seconds from the end of one sync to the next: a block may have to wait for the sync under way and for the next."""
 WRITERS: Final = 4
 """Number of blocks written at a time: a thread computes checksums at some 4 GB/s, and disks are faster with a queue."""
-RESERVE_FILE: Final = ".recording.reserve"
+RESERVE_FILE: Final = CLAIM_FILE
 RESERVE_BYTES: Final = 1 << 20
 """Bytes reserved beside the recording, so that manifest and summary have room if the recording fills the disk."""
 

@@ -13,6 +13,10 @@ try:
 except ImportError:  # on Windows nobody else can change a file that is open
     fcntl = None  # type: ignore[assignment]
 
+CLAIM_FILE = ".recording.reserve"
+"""File by which a run that grows in place claims its folder, before it has written anything else. A recording then
+reserves room with it."""
+
 
 def hold(fd: int, *, shared: bool = False) -> None:
     """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock.

@@ -35,7 +35,7 @@ from rig.depth.reconstruct import MapResult
 from rig.errors import UsageError
 from rig.estimate.registry import Learned
 from rig.estimate.row.model import RowModel
-from rig.run_folder.disk import is_held, replace_file, sync_folder
+from rig.run_folder.disk import CLAIM_FILE, is_held, replace_file, sync_folder
 from rig.run_folder.manifest import MANIFEST, sealed_text
 from rig.run_folder.pictures import (
     cloud,
@@ -149,6 +149,7 @@ class RunFolder:
     def keep(self) -> None:
         """Keep everything as it is, even if the run does not come to its end. Only for a folder that grows in place."""
         assert self._in_place, "a run folder that is no recording appears whole or not at all"
+        (self.path / CLAIM_FILE).unlink(missing_ok=True)
         self._scratch = None
         self._made_parents.clear()
 
@@ -185,6 +186,7 @@ class RunFolder:
 
     def _move(self, scratch: Path) -> Path:
         if self._in_place:
+            (self.path / CLAIM_FILE).unlink(missing_ok=True)
             return self.path
         if scratch.parent == self.path:  # an empty folder was given: fill it, summary.json last
             if list(self.path.iterdir()) == [scratch]:
@@ -219,12 +221,17 @@ class RunFolder:
         if there and not self.path.is_dir():
             raise UsageError(f"`out={self.path}` is a file; name a new folder")
         if there and any(self.path.iterdir()):
-            raise UsageError(f"`out={self.path}` exists and is not empty; name a new folder or empty this one")
+            raise _taken(self.path)
         missing = [folder for folder in self.path.parents if not folder.exists()]
         for folder in [*reversed(missing), *([self.path] if self._in_place and not there else ())]:
             folder.mkdir()
             self._made_parents.append(folder)
         if self._in_place:
+            try:
+                (self.path / CLAIM_FILE).open("xb").close()
+            except FileExistsError:  # another run has found it empty, too
+                self.discard()
+                raise _taken(self.path) from None
             return self.path
         scratch = (self.path if there else self.path.parent) / f".{self.path.name}.{secrets.token_hex(4)}.part"
         scratch.mkdir()
@@ -288,6 +295,10 @@ def _renamed(folder: Path, target: Path) -> bool:
             raise
         return False
     return True
+
+
+def _taken(path: Path) -> UsageError:
+    return UsageError(f"`out={path}` exists and is not empty; name a new folder or empty this one")
 
 
 def _unwritable(path: Path, error: OSError) -> UsageError:

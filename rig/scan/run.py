@@ -25,6 +25,7 @@ from rig.errors import UsageError
 from rig.progress import tell_stage
 from rig.recording.segment import Space
 from rig.recording.writer import Recording
+from rig.run_folder.disk import CLAIM_FILE
 from rig.run_folder.folder import Rays, RunFolder, SavePolicy
 from rig.run_folder.manifest import UNFINISHED, RunVerdict, file_crc32
 from rig.run_folder.summary import MapTally, RunFrames, Summary, Synchronisation
@@ -131,7 +132,7 @@ class Run:
             self._inputs = {
                 file.name: file_crc32(file)
                 for file in sorted(folder.path.iterdir())
-                if file.is_file() and file.name != CONTROL_FILE
+                if file.is_file() and file.name not in (CONTROL_FILE, CLAIM_FILE)
             }
         except OSError as error:
             raise UsageError(f"cannot write {folder.path}: {error.strerror or error}; name another `out`") from error

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -208,15 +207,22 @@ def test_a_run_is_not_moved_into_the_empty_folder_that_a_recording_has_claimed_m
     assert list(tmp_path.rglob("*")) == [published, published / "summary.json"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks that tell of it")
-def test_a_run_that_fails_leaves_what_another_records_in_the_same_folder(tmp_path: Path) -> None:
+def test_a_folder_that_grows_in_place_is_claimed_before_anything_is_in_it(tmp_path: Path) -> None:
     with RunFolder(tmp_path, in_place=True) as mine:
-        with RunFolder(tmp_path, in_place=True):  # it was empty then as well
-            recording = Recording(mine.place(""), expected_bytes=0)
-            recording.append(run_blocks()[0])
+        with pytest.raises(UsageError, match="exists and is not empty"):
+            RunFolder(tmp_path, in_place=True)
+        recording = Recording(mine.place(""), expected_bytes=0)
+        recording.append(run_blocks()[0])
         recording.close()
+        with pytest.raises(UsageError, match="exists and is not empty"):
+            RunFolder(tmp_path, in_place=True)
         mine.keep()
     assert RunRecording(tmp_path).frames == 16
+    assert {file.name for file in tmp_path.iterdir()} == {"frames-000000.spb", "frames.idx"}
+    with RunFolder(tmp_path / "views", in_place=True) as views:
+        (views.place("view")).touch()
+        views.publish()
+    assert [file.name for file in (tmp_path / "views").iterdir()] == ["view"]
 
 
 def test_an_empty_folder_is_filled_stays_when_nothing_comes_of_it_and_is_left_to_who_was_faster(tmp_path: Path) -> None:
