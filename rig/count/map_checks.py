@@ -79,6 +79,8 @@ LEAST_CONTRAST: Final = 0.5
 """Least mean light at sure answers above that behind them, in standard deviations of one answer; see the module."""
 LEAST_SHARE: Final = 0.4
 """Share of dim answers' signal that must be there. Right ones have 0.43 to 0.92 in dense fog at K = 3 exposures."""
+INCLINED_PX: Final = 2
+"""Pixels by which the line may move further than the planes say, to the nearest partner column."""
 LINE_PX, BEHIND_PX = (-1, 1), (3, 9)
 """First and last pixel of an answer's light and of the light behind it, counted from the answer towards far depths."""
 
@@ -92,6 +94,11 @@ TURNED_LIMIT, LEAST_OUT = 6.0, 2.0
 """Least mean difference by which unusable pixels stand out more where a turned picture has them: in its standard
 deviations, and in those of a count. On right maps it is negative."""
 
+NOT_FOLLOWING: Final = (
+    "columns do not follow one another: from column to column the line does not move as the calibration's planes do; "
+    "check the order of the frames (all exposures of a column, then the next column), columns and exposures of the "
+    "plan, the direction of the sweep, and that the planes are of this scan"
+)
 ORDERS: Final = ("the bits of each byte", *(f"the bytes of {bits}-bit words" for bits in (16, 32, 64)))
 """Wrong orders of pixels that are tried: what seems reversed in each."""
 
@@ -194,6 +201,8 @@ class MapChecks:
         usual = np.asarray(intensity / np.maximum(seen, 1), np.float32)
         usual[self._geometry.defects] = np.nan
         wrong = self._of_counts(counts, usual, DIMMEST * fired, stripe)
+        if wrong is None and self._knows and self._follows and self._strays(counts, stripe):
+            wrong = NOT_FOLLOWING
         if wrong is None and self._knows and (unlit := self._unlit(counts, stripe)):
             wrong, stripe = self._without_light(unlit), self._less_sure(stripe, unlit)
         return (() if wrong is None else (wrong,)), stripe
@@ -237,11 +246,7 @@ class MapChecks:
             _deviations(LEAST_FOLLOWING * rows - columns) > LIMIT
             or (self._alone and self._amiss(counts, lit, usual, least))
         ):
-            return (
-                "columns do not follow one another: from column to column the line does not move as the calibration's "
-                "planes do; check the order of the frames (all exposures of a column, then the next column), columns "
-                "and exposures of the plan, the direction of the sweep, and that the planes are of this scan"
-            )
+            return NOT_FOLLOWING
         return None
 
     def _compared(
@@ -296,10 +301,47 @@ class MapChecks:
         sure = lit[stripe.confidence[y[lit], c[lit]] >= SURE]
         return min(len(sure) // FEWEST_POINTS, GROUPS), sure
 
-    def _unlit(self, counts: "_Counts", stripe: StripeTable) -> list[Unlit]:
-        """The groups of sure answers that do not have the light that their confidence claims, near ones first."""
+    def _contrast(
+        self,
+        counts: "_Counts",
+        sure: NDArray[np.int64],
+        x: NDArray[np.int64],
+        partners: tuple[int, ...],
+        further: int = 0,
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Mean light on these partners of points where their answers x are, less that behind it, and number of partners
+        asked, both (sure,). further: pixels to either side of a line that count for it too."""
         from rig.count.map_check_kernels import add_contrast
 
+        geometry, points = self._geometry, counts.points
+        contrast, asked = np.zeros(len(sure)), np.zeros(len(sure), np.int64)
+        line_px = LINE_PX[0] - further, LINE_PX[1] + further
+        behind_px = BEHIND_PX[0] + further, BEHIND_PX[1] + further
+        for partner in partners:
+            add_contrast(
+                *counts.of_lines(partner, sure), points.row[partner, sure], points.column[partner, sure],
+                counts.exposures[partner, sure], x + points.shift[partner - 1, sure],
+                1 if geometry.near_is_left else -1, line_px, behind_px,
+                geometry.x0, geometry.x_lo, geometry.x_hi, geometry.width, contrast, asked,
+            )  # fmt: skip
+        return contrast, asked
+
+    def _strays(self, counts: "_Counts", stripe: StripeTable) -> bool:
+        """Whether sure answers have their light on the next row, but not in the nearest column to which the line has
+        moved by the planes. A line that stands still is the usual light of its pixels, so only its answers show it."""
+        groups, sure = self._sure(counts, stripe)
+        if not groups:
+            return False
+        x = np.rint(stripe.x_px[counts.points.row[0, sure], counts.points.column[0, sure]]).astype(np.int64)
+        row, of_row = self._contrast(counts, sure, x, (1,))
+        column, of_column = self._contrast(counts, sure, x, (2,), INCLINED_PX)
+        both = (of_row > 0) & (of_column > 0)
+        px = LINE_PX[1] - LINE_PX[0] + 1
+        lacking = LEAST_FOLLOWING * px * row - (px + 2 * INCLINED_PX) * column
+        return _deviations(lacking[both]) > LIMIT
+
+    def _unlit(self, counts: "_Counts", stripe: StripeTable) -> list[Unlit]:
+        """The groups of sure answers that do not have the light that their confidence claims, near ones first."""
         geometry, points = self._geometry, counts.points
         groups, sure = self._sure(counts, stripe)
         if not groups:
@@ -307,13 +349,7 @@ class MapChecks:
         y, c = points.row[0, sure], points.column[0, sure]
         x = np.rint(stripe.x_px[y, c]).astype(np.int64)
         away = 1 if geometry.near_is_left else -1
-        contrast, asked = np.zeros(len(sure)), np.zeros(len(sure), np.int64)
-        for partner in (1, 2):
-            add_contrast(
-                *counts.of_lines(partner, sure), points.row[partner, sure], points.column[partner, sure],
-                counts.exposures[partner, sure], x + points.shift[partner - 1, sure], away, LINE_PX, BEHIND_PX,
-                geometry.x0, geometry.x_lo, geometry.x_hi, geometry.width, contrast, asked,
-            )  # fmt: skip
+        contrast, asked = self._contrast(counts, sure, x, (1, 2))
         distance = away * (x - geometry.x_lo[y, c])
         order, unlit = np.argsort(distance, kind="stable"), []
         for group in np.array_split(order[asked[order] > 0], groups):

@@ -63,14 +63,15 @@ MOST_FIRST: Final = 48
 LEAST_SLOW: Final = 0.6
 """Least light that frames have in common with the next but one, relative to the next one: otherwise the line moves so
 fast that it may jump at the edge of a surface."""
-LEAST_COMMON: Final = 4.0
-"""Least number of ones in common with the next frame, summed over the frames before a seam: they might have no light by
-chance."""
+LEAST_COMMON: Final = 8.0
+"""Least number of ones that frames on both sides of a seam should have in common: they might have none by chance."""
+NEAR: Final = 5
+"""Frames on each side of a seam that are compared."""
 LAGS: Final = 4
 """Most frames by which those that are compared lie apart."""
 MOST_TORN: Final = 0.3
-"""Most light that frames on both sides of a seam have in common, relative to those behind it. At the edge of a surface
-it is 0.45 and more."""
+"""Most light that frames on both sides of a seam have in common, relative to those on either side. At the edge of a
+surface it is 0.45 and more."""
 MIXED: Final = (
     "frames of two maps seem mixed: {} have more light in common with the next but one than with the next; check where "
     "the frames come from, and that no light flickers at half their rate"
@@ -197,19 +198,27 @@ class SweepWatch:
         far = self._kept[have[[len(have) // 3, len(have) // 2, 2 * len(have) // 3]]] & usable
         usual = min(float(_ones(begin & each).mean()) for each in far)
         found = []
-        for seam in range(1 + max(math.ceil(self._delay), 0), self._exposures):
-            after = [of_lag[seam:] - usual for of_lag in common]
-            slow = [len(right) > 1 and right.mean() >= LEAST_SLOW * after[0].mean() for right in after]
-            if not slow[1] or seam * after[0].mean() < LEAST_COMMON:
+        for seam in range(2 + max(math.ceil(self._delay), 0), self._exposures):
+            all_after = [float(of_lag[seam:].mean()) - usual for of_lag in common]
+            if all_after[1] < LEAST_SLOW * all_after[0]:
                 continue
-            across = variance = expected = 0.0
-            for lag in np.flatnonzero(slow).tolist():
-                pairs, right = common[lag][max(seam - lag - 1, 0) : seam] - usual, after[lag]
-                across, expected = across + float(pairs.sum()), expected + len(pairs) * float(right.mean())
-                of_pair = max(float(right.var(ddof=1)), float(right.mean()) + usual)
-                variance += of_pair * len(pairs) * (1 + len(pairs) / len(right))
-            if across < MOST_TORN * expected:
-                found.append(((expected - across) / math.sqrt(max(variance, 1.0)), seam))
+            # A line that leaves one surface, or comes to another, is faint around the seam: compare with the nearest.
+            before: list[float] = []
+            after: list[float] = []
+            across: list[float] = []
+            for lag, (of_lag, level) in enumerate(zip(common, all_after, strict=True), 1):
+                if level >= LEAST_SLOW * all_after[0]:
+                    near = max(seam - NEAR, 0)
+                    before += (of_lag[near : max(seam - lag, near)] - usual).tolist()
+                    across += (of_lag[max(seam - lag, 0) : seam] - usual).tolist()
+                    after += (of_lag[seam : seam + NEAR - lag] - usual).tolist()
+            if not before or not after:
+                continue
+            least, fewest = min(float(np.mean(before)), float(np.mean(after))), min(len(before), len(after))
+            lack, n = len(across) * least - sum(across), len(across)
+            deviation = math.sqrt(max(n * (least + usual) * (1 + n / fewest), 1.0))
+            if n * least >= LEAST_COMMON and sum(across) < MOST_TORN * n * least:
+                found.append((lack / deviation, seam))
         deviations, seam = max(found, default=(0.0, 0))
         return (TORN.format(seam),) if deviations > LIMIT else ()
 

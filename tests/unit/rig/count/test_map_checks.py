@@ -158,6 +158,23 @@ def test_sure_answers_need_light() -> None:
     assert checks.check(volume, volume.intensity(), unsure) == ((), unsure)
 
 
+@pytest.mark.parametrize("rig", ["left", "right", "turned"])
+@pytest.mark.parametrize(("light", "exposures", "at"), [("clear", 2, 40), ("clear", 10, 120), ("report", 10, 40)])
+def test_a_line_that_stands_still_is_doubted_though_all_answers_find_it(
+    light: str, exposures: int, at: int, rig: str
+) -> None:
+    sweep = simulated(light, exposures, rig, rows=ROWS, columns=COLUMNS)
+    rng, geometry = np.random.default_rng(exposures), sweep.geometry
+    stuck = rng.binomial(exposures, np.broadcast_to(sweep.counts[at] / exposures, sweep.counts.shape))
+    volume = volume_of(stuck.astype(sweep.counts.dtype), geometry, exposures)
+    answers = np.repeat(sweep.point.truth()[:, at : at + 1], COLUMNS, axis=1)
+    there = np.isfinite(answers) & (answers >= geometry.x_lo) & (answers <= geometry.x_hi)
+    nothing, sure = np.zeros_like(answers), np.where(there, np.float32(0.95), np.float32(0.0))
+    stripe = StripeTable(answers, sure, nothing, np.full_like(answers, 0.01), nothing)
+    (reason,), _ = MapChecks(geometry, calibrated=True, knows=True).check(volume, volume.intensity(), stripe)
+    assert reason.startswith("columns do not follow one another")
+
+
 def test_a_map_of_few_points_is_not_judged() -> None:
     sweep = simulated("report", 10, rows=4, columns=30)
     volume = volume_of(noise(sweep.counts, 10, np.random.default_rng(0)), sweep.geometry, 10)

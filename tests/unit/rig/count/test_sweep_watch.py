@@ -105,7 +105,7 @@ def test_pixels_half_a_column_late_or_early_are_doubted(exposures: int) -> None:
         assert ("later than the gate" if by > 0 else "earlier than the gate") in doubt
 
 
-@pytest.mark.parametrize("exposures", [2, 3, 6, 10])
+@pytest.mark.parametrize("exposures", [6, 10, 16])
 def test_a_cube_whose_first_frames_are_of_another_place_is_doubted(exposures: int) -> None:
     for seed in range(3):
         taken = sweep(seed, exposures, photons=3.0)
@@ -125,7 +125,8 @@ def test_an_edge_of_a_surface_in_the_first_column_is_not_doubted() -> None:
         exposures = int(rng.choice([4, 8, 16]))
         at = rng.uniform(0, 1) / COLUMNS
         taken = sweep(seed, exposures, photons=3.0)
-        other = sweep(seed, exposures, photons=3.0, scene=90 + seed)
+        # Before it is another surface, or none.
+        other = sweep(seed, exposures, photons=3.0 * (seed % 2), scene=90 + seed)
         # The line, 1 px wide, is on both surfaces while it passes the edge.
         passed = np.clip((taken.since / exposures - at * COLUMNS) / 2.35 + 0.5, 0, 1)[:, None, None]
         bits = np.where(rng.random(taken.bits.shape, np.float32) < passed, taken.bits, other.bits)
