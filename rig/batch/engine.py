@@ -8,9 +8,9 @@ import contextlib
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from rig.batch.store import FAILURES, Store, failure_files
 from rig.batch.task import Ended, Status, Task
@@ -68,6 +68,10 @@ class Failure:
     attempts: int
     command: str
     detail: str = ""
+
+    def __str__(self) -> str:
+        """A line for the user."""
+        return failure_line(asdict(self))
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +169,13 @@ def run_batch(
     )  # fmt: skip
 
 
+def failure_line(failure: Mapping[str, Any]) -> str:
+    """One line that says which case failed, with its settings, and how. failure: with the keys of `Failure`."""
+    setting = ", ".join(f"{name} {value}" for name, value in failure["labels"].items())
+    times = "" if failure["attempts"] == 1 else f", {failure['attempts']} times"
+    return f"{setting or failure['case']}: {failure['kind']}{times}: {failure['message']}"
+
+
 class _Runs:
     """The course of a batch: what waits, what is under way, what has failed."""
 
@@ -240,6 +251,8 @@ class _Told:
             notes.append(f"{in_words(left_s)} left")
         if runs.failed:
             notes.append(f"{len(runs.failed)} failed")
+        if not ended and runs.under_way:
+            notes.append("the first cases load compiled code, which takes minutes where it is new")
         if not executor.workers:
             notes.append("waiting for workers")
         # The stage changes with each tenth, since of each stage a line goes to where there is no terminal.
@@ -270,6 +283,8 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> float:
         executor.close()
     if runs.failed:
         first = next(iter(runs.failed.values()))
+        if first.status == "other code":
+            raise UsageError("the program was changed while cases were tried; run the command again")
         raise UsageError(f"case {first.name} fails: {first.message}")
     times_s = runs.times_s[1:] or runs.times_s  # in the first one the process loads compiled code
     return statistics.fmean(times_s)

@@ -154,7 +154,7 @@ class Store:
         else:
             there = {each[CASE] for each in map(json.loads, listed.splitlines())}
             what = f"with other cases: {len(there)}, of which {len(there & self.cases.keys())} are the same"
-        raise UsageError(f"{self.folder} was begun {what}; name a new folder for this one as another study")
+        raise UsageError(f"{self.folder} was begun {what}; name another folder for what you ask now")
 
     def task(self, name: str) -> Task:
         """A case as it is sent to a worker."""

@@ -110,7 +110,8 @@ def _show_batch(done: "BatchResult") -> None:
     for note in batch.notes:
         say(note)
     for failure in batch.failures[:MOST_FAILURES]:
-        say(f"{failure.kind} ({failure.attempts} times): {failure.message}; to see it: {failure.command}")
+        limit = {"hung": ", without the study's time_limit", "memory": ", without the study's memory_limit"}
+        say(f"{failure}; to do it alone{limit.get(failure.kind, '')}: {failure.command}")
     if len(batch.failures) > MOST_FAILURES:
         say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / 'failures.jsonl'}")
     tell(

@@ -107,6 +107,11 @@ class Study(BaseModel):
             for key in dict.fromkeys(given)
             if key not in known and not (dotted and key.count(".") == 1)
         ]
+        problems += [
+            f"set gives {key} a list; set is for what all cases share, name the values under vary"
+            for key, value in self.set.items()
+            if isinstance(value, list) and "." not in key
+        ]
         if self.do in WHOLE and self.also:
             problems.append(f"also is not for {self.do}, which combines all lists; add its values to vary")
         size = len(self.seeds) * len(self.also)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, TypeGuard
 
 from calibration.errors import digits
+from rig.batch.engine import failure_line
 from rig.batch.store import LIST, Row, read_failures, read_rows
 from rig.config.bundled import short_names
 from rig.errors import UsageError
@@ -27,6 +28,10 @@ COLOURS: Final = "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9
 FIRST: Final = "depth_error_m", "stripe_error_px", "mean_abs_px", "mean_px", "valid_fraction"
 """Figures that are shown before others."""
 SEED: Final = "seed"
+OWN_FIGURES: Final = "tradeoff", "strategies"
+"""Folders of actions that draw figures of their own."""
+SHARES: Final = "within_1px", "missing"
+"""Figures that are shares, although they are among others with a unit."""
 _UNITS: Final = {"per_m": "1/m", "px": "px", "m": "m", "mm": "mm", "s": "s", "ms": "ms", "mj": "mJ", "deg": "degrees"}
 """Units by the end of a figure's name."""
 
@@ -65,7 +70,7 @@ def study_report(folder: Path) -> str:
     """The page on a study's folder. Raises UsageError if there is none, or no case is done."""
     rows = list(read_rows(folder))
     failures = read_failures(folder)
-    if not rows:
+    if not rows and not failures:
         raise UsageError(f"{folder} has no finished case yet; run `rig batch` first")
     lines, labels = lines_of(rows)
     lines = _with_short_names(lines)
@@ -74,20 +79,28 @@ def study_report(folder: Path) -> str:
         total = sum(1 for _ in stream)
     whole = len(rows) == total
     said = f"{len(rows)} of {total} cases are done"
-    columns = list(dict.fromkeys(key for line in lines for key in line))
+    verdict = "complete" if whole else "failures" if failures else "part"
+    known = [key for line in lines for key, value in line.items() if value is not None and value != ""]
+    columns = list(dict.fromkeys([*(label for label in labels if label in known), *known]))
     cells = [[_cell(line.get(key)) for key in columns] for line in lines[:SHOWN_LINES]]
     more = paragraph(f"{len(lines) - SHOWN_LINES} more lines are in table.csv", small=True)
     series = {each.label: each for panel in panels for each in panel.series}
     charts = legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels])
     return page(
         f"Study {folder.absolute().name}",
-        [verdict_box("complete" if whole else "part", said, [_said(each) for each in failures], good=whole)],
+        [verdict_box(verdict, said, list(map(failure_line, failures)), good=whole)],
         [
             ("Figures", charts if panels else ""),
+            *((name.capitalize(), "".join(drawings)) for name in OWN_FIGURES if (drawings := _drawings(folder / name))),
             ("All cases", table(list(map(_in_words, columns)), cells) + (more if len(lines) > SHOWN_LINES else "")),
             ("Repeat failed cases", preformatted("\n".join(each["command"] for each in failures)) if failures else ""),
         ],
     )
+
+
+def _drawings(folder: Path) -> list[str]:
+    """Figures of the results of an action, in its own folder, as SVG."""
+    return [file.read_text(encoding="utf-8") for file in sorted(folder.glob("*.svg"))]
 
 
 def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
@@ -108,7 +121,7 @@ def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
         for line in lines:
             x, y = line.get(over), line.get(key)
             if _is_number(x) and _is_number(y):
-                label = ", ".join(str(line.get(other)) for other in others)
+                label = ", ".join(f"{_in_words(other)} {line.get(other)}" for other in others)
                 curves.setdefault(label, {}).setdefault(float(x), []).append(float(y))
         series = [
             Series(
@@ -145,7 +158,8 @@ def _in_words(key: str) -> str:
     first, dot, rest = key.partition(".")
     unit = next((end for end in _UNITS if first.endswith(f"_{end}")), "")
     said = (first.removesuffix(f"_{unit}") + dot + rest).replace("_", " ").replace(".", ", ")
-    return f"{said} ({_UNITS[unit]})" if unit else said
+    shown = "share" if rest in SHARES else _UNITS.get(unit)
+    return f"{said} ({shown})" if shown else said
 
 
 def _numbers(lines: Sequence[Line], key: str) -> set[float]:
@@ -160,7 +174,3 @@ def _cell(value: object) -> str:
     if value is None:
         return "-"
     return digits(value) if isinstance(value, float) else str(value)
-
-
-def _said(failure: Mapping[str, Any]) -> str:
-    return f"{failure['kind']} ({failure['attempts']} times): {failure['message']}"

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product, starmap
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from rig.batch.case import Case, Result, files_of
 from rig.config.estimators import estimator_names
@@ -106,13 +106,20 @@ def cases_of(trials: Trials, asked: TradeoffRequest) -> list[Case]:
     return cases
 
 
+OF_ALL_ROWS: Final = (
+    "compute_ms", "times_limit", "exponent_nats", "times_wrong_limit", "position_sd_px", "times_position_limit",
+    "pareto", "pareto_compute",
+)  # fmt: skip
+"""Fields of a row that its scan alone does not decide: it is compared with others, or depends on the computer."""
+
+
 def scan_once(
     config: Mapping[str, Any], place: Place, methods: tuple[Sequence[str], Sequence[str]], seed: int
 ) -> dict[str, Any]:
     """One scan as a case: rows of all estimators and filters as plain values, with the times that they took apart."""
     rows = score_methods(RigConfig.model_validate(config), (place[0], place[1]), *methods, seed)
     return {
-        "rows": [{**asdict(row), "compute_ms": None} for row in rows],
+        "rows": [{key: value for key, value in asdict(row).items() if key not in OF_ALL_ROWS} for row in rows],
         "measured": {"compute_ms": [row.compute_ms for row in rows]},
     }
 

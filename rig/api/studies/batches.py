@@ -15,7 +15,7 @@ from rig.api import strategies, tradeoffs
 from rig.batch.case import Case, Result
 from rig.batch.engine import Batch, Executor, probe, run_batch
 from rig.batch.pool import Limits, Pool, usual_workers
-from rig.batch.store import Row, Store, read_rows
+from rig.batch.store import Row, Store, read_failures, read_rows
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
 from rig.progress import Progress
@@ -136,7 +136,9 @@ def repeat_case(study: StudyLike, name: str) -> Result:
         with Store(Path(place) / "store", made.cases) as store:
             case = store.cases.get(name)
         if case is None:
-            raise UsageError(f"the study has no case {name!r}; its names change with the study and with the code")
+            raise UsageError(
+                f"the study has no case {name!r}; its names are in cases.jsonl, and change with the study and the code"
+            )
         keep = {"keep": str(Path(place) / "files")} if case.keeps else {}
         return replace(case, inputs={**case.inputs, **keep}).call()
 
@@ -194,17 +196,18 @@ def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Cl
 def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
     """Write the table, the page and, for a trade-off, its own files. Old ones are replaced."""
     rows = list(store.rows())
-    if not rows:
+    if not rows and not read_failures(store.folder):
         return
-    replace_file(store.folder / "table.csv", csv_of(lines_of(rows)[0]).encode())
-    replace_file(store.folder / "report.html", study_report(store.folder).encode())
-    if made.write is not None:
+    if rows:
+        replace_file(store.folder / "table.csv", csv_of(lines_of(rows)[0]).encode())
+    if made.write is not None and rows:
         results = {row.case: {**row.result, "measured": row.measured} for row in rows}
         found: list[Result | None] = [results.get(name) for name in store.names]
         place = store.folder / made.name
         shutil.rmtree(place, ignore_errors=True)
         with RunFolder(place) as folder:
             made.write(folder, found, aborted)
+    replace_file(store.folder / "report.html", study_report(store.folder).encode())
 
 
 def _named(study: StudyLike) -> str:

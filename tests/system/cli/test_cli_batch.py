@@ -62,7 +62,7 @@ def test_a_study_of_scans_gives_the_figures_of_scans_whoever_does_them(
     with (tmp_path / "shards" / "table.csv").open() as stream:
         lines = list(csv.DictReader(stream))
     assert [line["estimator"] for line in lines] == ["argmax", "argmax", "edge", "edge"]
-    assert "stripe_error_px" in (tmp_path / "shards" / "report.html").read_text()
+    assert "stripe error" in (tmp_path / "shards" / "report.html").read_text()
 
 
 @pytest.mark.usefixtures("here")
@@ -171,7 +171,7 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     result = json.loads(alone.out)
     assert {key: result[key] for key in row["result"]} == row["result"]
     assert rig("batch", "study.yaml", "--case", "nonsense").problems == [
-        "error: the study has no case 'nonsense'; its names change with the study and with the code"
+        "error: the study has no case 'nonsense'; its names are in cases.jsonl, and change with the study and the code"
     ]
     assert "complete: 1 of 1 cases done, 0 of them now" in rig("batch", "study.yaml", "--out", "study").out
 
@@ -184,4 +184,4 @@ def test_failures_are_named_with_the_command_that_repeats_them(rig: Rig, monkeyp
     assert ran.code == 1
     assert "failures: 0 of 6 cases done, 0 of them now" in ran.out
     repeat = f"rig batch study.yaml --out study --case {fail.given[0]}"
-    assert f"raised (1 times): ValueError: too bright; to see it: {repeat}" in ran.err
+    assert f"raised: ValueError: too bright; to do it alone: {repeat}" in ran.err

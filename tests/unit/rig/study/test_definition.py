@@ -25,6 +25,10 @@ def problems_of(content: dict[str, Any]) -> list[str]:
         ({"do": "scan", "vari": {}}, "study: 'vari' is no key of a study; its keys are do, vary, also, set, omit,"),
         ({"do": "scan", "vary": {"maps": []}}, "study: vary.maps: list should have at least 1 item"),
         ({"do": "scan", "vary": {"maps": 3}}, "study: vary.maps: input should be a valid list"),
+        (
+            {"do": "scan", "set": {"estimator": ["edge", "joint"]}},
+            "set gives estimator a list; set is for what all cases",
+        ),
         ({"do": "scan", "omit": [{}]}, "study: omit.0: dictionary should have at least 1 item"),
         ({"do": "scan", "repeat": 0}, "study: repeat: input should be greater than or equal to 1"),
         ({"do": "scan", "seed": -1}, "study: seed: input should be greater than or equal to 0"),
@@ -133,3 +137,10 @@ def test_every_action_says_which_settings_it_has() -> None:
         (said,) = problems_of({"do": action, "set": {"nonsense": 1}})
         assert f"it has {', '.join(keys)}" in said
         assert ("keys of the config such as scan.columns" in said) == (action in ("scan", "calibrate"))
+
+
+@pytest.mark.parametrize("action", KEYS)
+def test_the_guide_names_all_settings(action: str) -> None:
+    guide = (Path(__file__).parents[4] / "docs/how-to/batch.md").read_text(encoding="utf-8")
+    (line,) = (line for line in guide.splitlines() if line.startswith(f"| `{action}` |"))
+    assert [key for key in KEYS[action] if f"`{key}`" not in line] == []

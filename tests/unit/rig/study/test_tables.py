@@ -54,7 +54,7 @@ def test_a_panel_shows_means_over_seeds_along_the_setting_with_most_numbers() ->
         for fog, more in (("clear", 0), ("20m", 100)) for k in (1, 3, 10) for seed in (0, 2)
     ]  # fmt: skip
     (panel,) = panels_of(lines, ["fog", "exposures", "seed"])
-    assert [each.label for each in panel.series] == ["clear", "20m"]
+    assert [each.label for each in panel.series] == ["fog clear", "fog 20m"]
     assert panel.series[0].points == [(1.0, 11.0), (3.0, 31.0), (10.0, 101.0)]
     assert panel.series[0].intervals == [(10.0, 12.0), (30.0, 32.0), (100.0, 102.0)]
     assert panel.series[1].points[0] == (1.0, 111.0)
@@ -85,7 +85,7 @@ def test_the_page_of_a_study_has_its_lines_its_figure_and_how_to_repeat_what_fai
     page = study_report(tmp_path / "a study")
     assert "Study a study" in page
     assert "6 of 7 cases are done" in page
-    assert "raised (1 times): ValueError: no 7 second line" in page
+    assert "x 7: raised: ValueError: no 7 second line" in page
     assert f"rig batch study.yaml --out study --case {done.failures[0].case}" in page
     assert "2 more lines are in table.csv" in page
     start = page.index("<svg")
@@ -97,6 +97,33 @@ def test_without_a_finished_case_there_is_no_page(tmp_path: Path) -> None:
     Store(tmp_path / "out", squares(2)).close()
     with pytest.raises(UsageError, match=r"has no finished case yet; run `rig batch` first"):
         study_report(tmp_path / "out")
+
+
+def test_a_study_of_which_all_cases_failed_has_a_page_that_says_so(tmp_path: Path) -> None:
+    with Store(tmp_path / "out", troubles("raise", tmp_path / "counts", (7,))) as store:
+        run_batch(store, Inline())
+    page = study_report(tmp_path / "out")
+    assert "0 of 1 cases are done" in page
+    assert "x 7: raised: ValueError: no 7 second line" in page
+
+
+def test_columns_begin_with_what_varies_and_empty_ones_are_left_out(tmp_path: Path) -> None:
+    cases = [
+        Case("tests.unit.rig.study.test_tables:half_empty", {"n": n}, {"z_last": n, "estimator": "edge"})
+        for n in (1, 2)
+    ]
+    with Store(tmp_path / "out", cases) as store:
+        run_batch(store, Inline())
+    page = study_report(tmp_path / "out")
+    page = page[page.index("<table") :]
+    heads = [page.index(f">{name}<") for name in ("estimator", "z last", "a error (px)", "error, missing (share)")]
+    assert heads == sorted(heads)
+    assert ">nothing<" not in page
+
+
+def half_empty(n: int) -> dict[str, Any]:
+    """A case: a figure, a share beside it, and nothing."""
+    return {"error_px": {"missing": 0.5}, "a_error_px": n, "nothing": None}
 
 
 def test_the_order_of_results_does_not_change_the_page_or_the_csv(tmp_path: Path) -> None:
