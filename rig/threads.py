@@ -30,7 +30,7 @@ class _Begun(threading.Event):
     """The event for which `Thread.start` waits. Python waits for ever if a thread finds no memory to begin with."""
 
     def wait(self, timeout: float | None = None) -> bool:
-        """As usual; without a timeout raises MemoryError after `_BEGIN_S`."""
+        """Wait as usual; without a timeout raises MemoryError after `_BEGIN_S`."""
         if super().wait(_BEGIN_S if timeout is None else timeout):
             return True
         if timeout is None:

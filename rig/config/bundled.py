@@ -36,7 +36,7 @@ def bundled_scenes() -> tuple[Bundled, ...]:
 
 
 def short_names(scenes: Iterable[str]) -> dict[str, str]:
-    """What to call scenes in tables: the last part of each path, or all of it if another one ends in the same part."""
+    """Names of scenes for tables, by path: its last part, or all of it if another one ends in the same part."""
     last = {scene: scene.rstrip("/").rsplit("/", 1)[-1] for scene in scenes}
     names = list(last.values())
     return {scene: name if names.count(name) == 1 else scene for scene, name in last.items()}
