@@ -1,10 +1,12 @@
 """One trial: a scan of the simulated rig that two or three faults strike, and what is left of it, bit for bit."""
 
+import atexit
 import faulthandler
 import functools
 import gc
 import json
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -76,6 +78,7 @@ class Watched:
 def base_of(number: int, estimator: str) -> Base:
     """The undisturbed scan of this number; once in each process."""
     folder = Path(tempfile.mkdtemp(prefix="faults-base-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     content = config()
     content["world"]["scene"] = SCENES[number % len(SCENES)]
     content["scan"]["exposures"] = EXPOSURES
