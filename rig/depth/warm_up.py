@@ -54,8 +54,9 @@ def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
     if estimator in COUPLED and isinstance(maker.used, RowModel) and isinstance(sweep, CountVolume):
         from rig.estimate.joint.joint import Joint
 
-        # A halo, which may turn up in any map of `joint`, needs further kernels.
-        Joint(1, replace(maker.used, halo=np.full_like(maker.used.halo, 1e-3))).estimate(sweep, geometry)
+        # A halo, which may turn up in any map of `joint`, needs further kernels, and more if it is not fully believed.
+        halo = np.full_like(maker.used.halo, 1e-3)
+        Joint(1, replace(maker.used, halo=halo, belief=0.5)).estimate(sweep, geometry)
     if filter == "median":
         from rig.estimate.median import median_filter
 

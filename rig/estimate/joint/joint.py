@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rig.count.volume import Counter, CountVolume, SweepCounter, SweepLayout
 from rig.estimate.joint.halo import halfway, learn_first_halo, learn_next_halo
+from rig.estimate.joint.place.belief import belief_of
 from rig.estimate.joint.place.place import amplitudes_of, line_width, weigh_light
 from rig.estimate.joint.solver import MapSolver
 from rig.estimate.joint.tables import MOST_BYTES, JointTables, bytes_of, grid_of, tables_of
@@ -26,7 +27,7 @@ from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.online_learning import LearningSetting, OnlineLearner, first_model
 from rig.estimate.row.ambient import ambient_map
 from rig.estimate.row.em import expect, learn_again, lines_of, next_lattice
-from rig.estimate.row.inputs import state_of
+from rig.estimate.row.inputs import halo_shares, state_of
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
 from rig.geometry.windows import SweepGeometry
@@ -46,6 +47,11 @@ TRUSTED = np.float32(0.5)
 """An answer teaches if its trust (`fill_trust`) exceeds this; in lessons with contrast only these teach amplitudes."""
 COUNTING_THREADS = 4
 """Most threads that count: more only get into each other's way, since counting waits for memory."""
+MISLED = 0.2
+"""Relative error of the light of a learned fog above which light scattered many times may hide the stripes."""
+START_BELIEF = 0.1
+"""Belief in the medium learned row by row, which knows no halo, when lessons begin again by contrast: it only decides
+between places that look alike."""
 LOST = 0.2
 """If a smaller share of answers teaches the last lesson in fog, light scattered many times may hide the stripes."""
 
@@ -153,17 +159,25 @@ class Joint:
         witness_px, lessons, intensity, misled = None, 0, volume.intensity(self._workers), model
         foggy = bool(model.profile[:, 0].max() > np.median(model.ambient))
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
-            (model, teaching), lessons = self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
-            lost = foggy and lessons == LESSONS and teaching < LOST
+            (taught, teaching, error), lessons = (
+                self._taught(volume, intensity, geometry, model, witness_px), lessons + 1
+            )  # fmt: skip
+            if witness_px is not None and model.halo.any() and taught.halo.any() and taught.belief < model.belief:
+                break  # a lesson that explains less of the counts has learned from wrong stripes
+            model = taught
+            lost = foggy and lessons == LESSONS and (teaching < LOST or error > MISLED)
             if witness_px is None and (model.halo.any() or lost):
                 # Light scattered many times may have misled these lessons: they found a halo, or too few stripes to
                 # find one. Begin again, and check stripes by contrast.
                 misled = model
                 setting = LearningSetting(model, geometry, volume.exposures, volume.dark_counts is not None)
                 tables = tables_of(setting, self._workers, contrast=True)
-                witness_px, model, lessons = self._solver.by_contrast(volume, tables), start, 0
+                witness_px, lessons = self._solver.by_contrast(volume, tables), 0
+                model = replace(start, belief=START_BELIEF)
+        if witness_px is None:
+            return replace(model, belief=1.0)
         # Lost stripes prove no halo. Without a halo, nothing has to be learned by contrast.
-        return misled if witness_px is not None and not (model.halo.any() or misled.halo.any()) else model
+        return model if model.halo.any() or misled.halo.any() else replace(misled, belief=1.0)
 
     def _adapted(
         self, kept: RowModel, fresh: RowModel, volume: CountVolume, geometry: SweepGeometry
@@ -191,8 +205,9 @@ class Joint:
     def _taught(
         self, volume: CountVolume, intensity: NDArray[np.uint32], geometry: SweepGeometry, model: RowModel,
         witness_px: Float32 | None,
-    ) -> tuple[RowModel, float]:  # fmt: skip
-        """The model learned from stripes that are estimated with `model`, and the share of answers that teach it.
+    ) -> tuple[RowModel, float, float]:  # fmt: skip
+        """The model learned from stripes that are estimated with `model`, the share of answers that teach it, and the
+        relative error of its light.
 
         intensity: of the volume. witness_px: of `by_contrast`, or None; stripes over AGREE_PX from it are left out.
         """
@@ -217,7 +232,14 @@ class Joint:
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
         amplitude, weight = amplitudes_of(places, None if witness_px is None else stripes.confidence > TRUSTED)
-        return replace(model, amplitude=amplitude, weight=weight), float(np.mean(stripes.confidence > TRUSTED))
+        lines = lines_of(volume, next_lattice(geometry), stripes)
+        shares = halo_shares(model, geometry.width if model.halo.any() else 0)
+        light = places.light[lines.row, lines.column]
+        belief, error = belief_of(
+            lines, light, tables.sweep, state_of(model), shares, model.hot_flux(), self._workers
+        )  # fmt: skip
+        model = replace(model, amplitude=amplitude, weight=weight, belief=belief)
+        return model, float(np.mean(stripes.confidence > TRUSTED)), error
 
 
 @dataclass(slots=True, eq=False)

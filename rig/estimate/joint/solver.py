@@ -12,13 +12,14 @@ import numpy as np
 from rig.count.volume import CountVolume
 from rig.estimate.joint.confidence import pairs_to_ask, stripe_table
 from rig.estimate.joint.halo import bright_lines
-from rig.estimate.joint.labels.contrast import cost_contrast
+from rig.estimate.joint.labels.contrast import cost_contrast, share_of
 from rig.estimate.joint.labels.cost_rows import CostRoom
 from rig.estimate.joint.labels.grid import BAND_ROWS, LabelGrid
 from rig.estimate.joint.lesson import add_quiet, fill_trust, read_positions
 from rig.estimate.joint.paths import CHUNK, along_columns, along_rows
 from rig.estimate.joint.place.place import new_places, place
 from rig.estimate.joint.place.places import Places
+from rig.estimate.joint.place.shown import lower_unshown
 from rig.estimate.joint.second_returns import SecondRoom, behind_specks, second_returns, second_room
 from rig.estimate.joint.tables import JointTables
 from rig.estimate.joint.temporal import TemporalPrior
@@ -94,7 +95,12 @@ class MapSolver:
         sd = place(*seen, tables.shares, x_px, memory.places, workers, lesson=lesson)
         lit = volume.n_frames > 0
         pairs = tables.pairs if lit.all() else pairs_to_ask(np.isfinite(grid.x_far) & lit)
-        return stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
+        table = stripe_table(x_px, sd, volume.n_frames, memory.answer, memory.places, pairs, tables.bright, workers)
+        if lesson or tables.contrast is None or tables.belief >= 1.0:
+            return table
+        workers.settle()
+        shown = lower_unshown(volume, x_px, table.confidence, tables.belief, workers)
+        return replace(table, confidence=shown)
 
     def by_contrast(self, volume: CountVolume, tables: JointTables) -> Float32:
         """x_px (rows, columns) from the costs of `rig.estimate.joint.labels.contrast` alone."""
@@ -146,6 +152,7 @@ class MapSolver:
         grid, workers = tables.grid, self._workers
         rows, columns = x_px.shape
         memory, rooms = self._room(grid), self._cost_rooms(tables)
+        share = 0 if alone else share_of(tables.belief)
 
         def tie_rows(first: int, last: int) -> None:
             # Band by band: rows of a band share tables, and their costs are tied while they are still in the cache.
@@ -157,7 +164,7 @@ class MapSolver:
                 end = min(band + BAND_ROWS, last)
                 tables.costs.fill(volume, band, end, room_at, memory.cost)
                 if tables.contrast is not None:
-                    cost_contrast(volume, tables.contrast, band, end, memory.cost, alone=alone)
+                    cost_contrast(volume, tables.contrast, band, end, memory.cost, share)
                 if self._prior is not None:
                     self._prior.add(volume, band, end, memory.cost)
                 along_rows(memory.cost, memory.message, band, end)

@@ -42,6 +42,8 @@ class JointTables(NamedTuple):
     bright: Brightness
     dark: bool
     settings: AnswerSettings
+    belief: float
+    """In the medium of the model; of no effect without `contrast`."""
     pairs: Float32
     """Pairs of `pairs_to_ask`, for maps whose columns all have frames."""
 
@@ -77,5 +79,6 @@ def tables_of(setting: LearningSetting, workers: RowWorkers, *, contrast: bool =
     return JointTables(
         grid, costs, by_contrast, sweep, state, profile_table(sigma_px),
         halo_shares(model, geometry.width if model.halo.any() else 0), second_light(state, sigma_px, grid, sweep),
-        brightness_of(model), setting.dark, answer_settings(grid.stripes), pairs_to_ask(np.isfinite(grid.x_far)),
+        brightness_of(model), setting.dark, answer_settings(grid.stripes), model.belief,
+        pairs_to_ask(np.isfinite(grid.x_far)),
     )  # fmt: skip

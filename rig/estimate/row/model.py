@@ -49,7 +49,8 @@ _FORMS = {
     "before": ("uint16", 3),
 }
 """Types and dimensions of the arrays; other fields are numbers. Kernels check neither."""
-_LIMITS = {"w_lo": (0.0, 1e3), "per_w": (1e-6, 1e12), "none_weight": (0.0, 1.0), "line_sigma_px": (0.05, 20.0)}
+_LIMITS = {"w_lo": (0.0, 1e3), "per_w": (1e-6, 1e12), "none_weight": (0.0, 1.0), "line_sigma_px": (0.05, 20.0),
+           "belief": (0.0, 1.0)}  # fmt: skip
 """Bounds of numbers by which tables are made, far beyond those of any state."""
 
 
@@ -65,7 +66,8 @@ class RowModel:
     profile. extinction_per_m: NaN if no haze could be fitted; its standard deviation is then NaN, too, and infinite if
     the fit hardly depends on the extinction. halo: (HALO_NODES, reaches) float32, light of the halo as a share of the
     stripe's (`rig.estimate.row.inputs`), 0 if there is none. before: uint16 (2, rows, columns), the previous map as a
-    prior (`rig.estimate.joint.temporal`), None if not used.
+    prior (`rig.estimate.joint.temporal`), None if not used. belief: how far the medium is believed under a halo, 0 to 1
+    (`rig.estimate.joint.place.belief`).
     """
 
     profile: Float32
@@ -82,6 +84,7 @@ class RowModel:
     extinction_sd_per_m: float
     halo: Float32 = field_of(default_factory=lambda: np.zeros((HALO_NODES, len(HALO_REACHES_PX)), np.float32))
     before: NDArray[np.uint16] | None = None
+    belief: float = 1.0
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Every field that is not None as an array, to be kept with the map."""
@@ -108,7 +111,7 @@ class RowModel:
             raise ValueError(f"before is of {len(kept['before'])} parts, not 2")
         values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in kept.items()}
         for name, (low, high) in _LIMITS.items():
-            if not low <= values[name] <= high:
+            if name in values and not low <= values[name] <= high:
                 raise ValueError(f"{name} is {values[name]:g}, outside {low:g} to {high:g}")
         return cls(**values)
 

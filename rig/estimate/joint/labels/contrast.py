@@ -41,6 +41,9 @@ LEAST_ONES: Final = np.float32(0.5)
 """Number of ones assumed for surroundings without any."""
 MOST_SHARE: Final = np.float32(1.0 - 1e-4)
 """Largest p and p0, so that scores stay finite."""
+WHOLE_BITS: Final = 8
+WHOLE: Final = 1 << WHOLE_BITS
+"""Weights of the mean of two costs add up to this; 16 bits hold the sum."""
 _AHEAD: Final = 2
 """Memory is prefetched this many rows ahead."""
 
@@ -76,18 +79,25 @@ def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
     )  # fmt: skip
 
 
-def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, *, alone: bool) -> None:
-    """Replace the costs of rows first..last-1 by these costs or, if not alone, by the mean of both.
+def share_of(belief: float) -> int:
+    """Share of the model's costs in the mean with these costs, in 1 / WHOLE: a half if the model is fully believed."""
+    return round(WHOLE * belief / (1.0 + belief))
+
+
+def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, share: int) -> None:
+    """Replace the costs of rows first..last-1 by the weighted mean of them and of these costs.
+
+    share: weight of the former costs in 1 / WHOLE, 0 for these costs alone.
 
     cost: uint8 (rows, columns, labels) of all rows. EXCLUDED labels and columns without frames keep their costs.
     Threads may fill different rows at once.
     """
-    _fill(volume.counts, volume.n_frames, volume.x0, contrast, first, last, alone, cost)
+    _fill(volume.counts, volume.n_frames, volume.x0, contrast, first, last, share, cost)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
-    counts: Counts, n_frames: Int32, x0: Int32, contrast: Contrast, first_row: int, last_row: int, alone: bool,
+    counts: Counts, n_frames: Int32, x0: Int32, contrast: Contrast, first_row: int, last_row: int, share: int,
     cost: Uint8,
 ) -> None:  # fmt: skip
     (columns, rows, window), labels, side = counts.shape, cost.shape[2], contrast.side
@@ -135,10 +145,10 @@ def _fill(
             skipped = far - (high - 1) if side > 0 else low - far
             shift = (here[LABEL] + here[ODD]) % PHASES - PHASES * skipped - here[LABEL]
             first, end = max(int(here[LABEL]), -shift), min(int(here[LABEL_END]), PHASES * (high - low) - shift)
-            _write_costs(own[first + shift :], alone, cost[y, c, first:end])
+            _write_costs(own[first + shift :], share, cost[y, c, first:end])
             own[:] = none
-            _write_costs(own, alone, cost[y, c, here[LABEL] : first])
-            _write_costs(own, alone, cost[y, c, end : here[LABEL_END]])
+            _write_costs(own, share, cost[y, c, here[LABEL] : first])
+            _write_costs(own, share, cost[y, c, end : here[LABEL_END]])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -226,9 +236,10 @@ def _write_own(score: Float32, low: int, high: int, side: int, units: float, own
 
 
 @numba.njit(cache=True, nogil=True)
-def _write_costs(own: Uint8, alone: bool, cost: Uint8) -> None:
-    """Write own, or its mean with cost, to cost (labels,), except where cost is EXCLUDED."""
+def _write_costs(own: Uint8, share: int, cost: Uint8) -> None:
+    """Write the weighted mean of cost and own to cost (labels,), except where cost is EXCLUDED."""
+    model, other, half = np.uint16(share), np.uint16(WHOLE - share), np.uint16(WHOLE // 2)
     for label in range(cost.shape[0]):
         before = cost[label]
-        mean = np.uint8((np.uint16(before) + np.uint16(own[label]) + np.uint16(1)) >> np.uint16(1))
-        cost[label] = before if before == EXCLUDED else own[label] if alone else mean
+        mean = np.uint8((np.uint16(before) * model + np.uint16(own[label]) * other + half) >> np.uint16(WHOLE_BITS))
+        cost[label] = before if before == EXCLUDED else mean

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from rig.estimate.joint.labels import contrast as module
-from rig.estimate.joint.labels.contrast import BESIDE_PX, LEAST_ONES, MOST_SHARE, REACH_PX, ROWS, contrast_of
+from rig.estimate.joint.labels.contrast import (
+    BESIDE_PX,
+    LEAST_ONES,
+    MOST_SHARE,
+    REACH_PX,
+    ROWS,
+    WHOLE,
+    contrast_of,
+    share_of,
+)
 from rig.estimate.joint.labels.contrast import cost_contrast as fill
 from rig.estimate.joint.labels.cost_rows import COST_LIMIT, EXCLUDED
 from rig.estimate.joint.labels.costs import costs_of
@@ -64,8 +73,8 @@ def test_costs_are_those_written_out_and_mix_with_others(rig, padding):
     alone, mixed = (np.full((geometry.rows, geometry.columns, grid.labels), 100, np.uint8) for _ in range(2))
     alone[:, :, 7] = mixed[:, :, 7] = EXCLUDED
     for first, last in ((0, 20), (20, geometry.rows)):
-        fill(volume, contrast, first, last, alone, alone=True)
-        fill(volume, contrast, first, last, mixed, alone=False)
+        fill(volume, contrast, first, last, alone, 0)
+        fill(volume, contrast, first, last, mixed, share_of(1.0))
     checked = 0
     for y in (0, 5, 19, 20, 31):
         for c in range(0, geometry.columns, 7):
@@ -88,7 +97,7 @@ def test_nothing_and_everything_have_finite_costs():
         counts = np.full_like(volume.counts, value)
         cost = np.zeros((geometry.rows, geometry.columns, grid.labels), np.uint8)
         same = replace(volume, counts=counts)
-        fill(same, contrast_of(costs, SIGMA_PX, geometry.width), 0, geometry.rows, cost, alone=True)
+        fill(same, contrast_of(costs, SIGMA_PX, geometry.width), 0, geometry.rows, cost, 0)
         assert cost.max() == 0, "no label is better than another"
 
 
@@ -108,5 +117,11 @@ def test_a_hot_pixel_changes_no_cost_of_the_rows_around_it():
             if 0 <= x - volume.x0[c] < counts.shape[2]:
                 counts[c, y, x - volume.x0[c]] = level
         filled.append(np.full((rows, geometry.columns, grid.labels), 100, np.uint8))
-        fill(replace(volume, counts=counts), hot, 0, rows, filled[-1], alone=True)
+        fill(replace(volume, counts=counts), hot, 0, rows, filled[-1], 0)
     np.testing.assert_array_equal(*filled)
+
+
+def test_less_believed_medium_has_a_smaller_share():
+    assert share_of(1.0) == WHOLE // 2
+    assert share_of(0.0) == 0
+    assert 0 < share_of(0.1) < share_of(0.5) < WHOLE // 2
