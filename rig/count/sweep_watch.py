@@ -96,17 +96,18 @@ class SweepWatch:
     exposures: frames per column. frames: lit ones of a map. gate: for each leg, when the gate opens and closes, in
     frames since the mirror enters the first column; empty if frames have no marks. delay: of the light after the gate,
     in frames, as far as it is known. exposed: share of a frame's period. whole: whether the frames are of the whole
-    sensor, so that their ones tell of light.
+    sensor, so that their ones tell of light. every: one of so many sweeps is watched, the first one among them.
     """
 
     def __init__(
         self, exposures: int, frames: int, gate: Sequence[tuple[float, float]] = (), *, delay: float = 0.0,
-        exposed: float = 1.0, whole: bool = True,
+        exposed: float = 1.0, whole: bool = True, every: int = 1,
     ) -> None:  # fmt: skip
         self._exposures, self._frames, self._gate = exposures, frames, gate
         self._delay, self._exposed, self._whole = delay, exposed, whole
         self._reach = min(exposures + EDGE, MOST_LATE)
         self._wanted: NDArray[np.int64] | None = None
+        self._every, self._sweeps = every, 0
         self._reset()
 
     def _reset(self) -> None:
@@ -122,6 +123,8 @@ class SweepWatch:
         """Look at frames of the sweep: packed bits (n, rows, row bytes), and (n,) numbers, whether they are counted for
         a column, first used pixels, middles of exposures in frames since the mirror entered the first column, and
         marks. Frames come in order."""
+        if self._sweeps % self._every:
+            return
         if self._first is None and lit.any():
             self._first = int(numbers[int(lit.argmax())])
         if self._first is not None:
@@ -137,6 +140,9 @@ class SweepWatch:
 
     def finish(self, leg: int = 0) -> tuple[str, ...]:
         """Doubts about the sweep, at most one; the next one begins. leg: the sweep's."""
+        self._sweeps += 1
+        if (self._sweeps - 1) % self._every:
+            return ()
         try:
             return self._mixed() or self._late(leg) or self._torn()
         finally:

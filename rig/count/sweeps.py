@@ -21,6 +21,8 @@ from rig.shared_time import SharedTime
 
 _log = logging.getLogger(__name__)
 
+WATCH_S = 0.1
+"""Time between sweeps whose frames are watched, up to 7 ms of a core each, with which a live scan must keep up."""
 MOST_UNDER_WAY = 16
 """Most blocks that counting may hold at a time: threads are still at work on some while the next one is bound."""
 
@@ -275,7 +277,10 @@ def _sweep_watch(plan: ScanPlan, gate_delay_s: float) -> SweepWatch:
     frames = plan.places * plan.exposures
     by_markers = gate if plan.blanking is None else ()
     late, exposed = gate_delay_s * rate, plan.exposure_s * rate
-    return SweepWatch(plan.exposures, frames, by_markers, delay=late, exposed=exposed, whole=not plan.windowed)
+    return SweepWatch(
+        plan.exposures, frames, by_markers, delay=late, exposed=exposed, whole=not plan.windowed,
+        every=round(WATCH_S / plan.sweep_s) | 1,  # odd, so that both ways of the mirror have their turn
+    )  # fmt: skip
 
 
 def _warn(sweep: SweepData) -> None:

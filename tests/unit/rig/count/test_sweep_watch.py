@@ -176,3 +176,14 @@ def test_blocks_and_earlier_sweeps_change_nothing_and_lost_frames_say_nothing() 
     watch.add(np.packbits(mixed.bits, axis=2)[kept], kept, kept >= BEFORE, np.zeros(len(kept), np.int32))
     assert watch.finish() == ()
     assert watch.finish() == ()
+
+
+def test_one_of_so_many_sweeps_is_watched_and_the_first_among_them() -> None:
+    one, other = sweep(8, 4), sweep(8, 4, scene=60)
+    turn = (np.arange(len(one.since)) % 2 == 1)[:, None, None]
+    bits, number = np.packbits(np.where(turn, other.bits, one.bits), axis=2), np.arange(len(one.since))
+    watch, found = SweepWatch(4, COLUMNS * 4, every=3), []
+    for _ in range(7):
+        watch.add(bits, number, number >= BEFORE, np.zeros(len(number), np.int32))
+        found.append(bool(watch.finish()))
+    assert found == [True, False, False, True, False, False, True]
