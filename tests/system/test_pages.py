@@ -25,6 +25,8 @@ NOT_RUN: Mapping[str, str] = {
     r"rig calibrate (?!pixels)": "needs pictures of a board, and minutes: tests/system/calibrate",
     r"rig (import|reconstruct runs/)": "needs files of other cameras: tests/system/cli/test_cli_exchange.py",
     r"rig batch\b": "takes minutes: tests/system/cli/test_cli_batch.py",
+    r"rig (scan|reconstruct) .*--out (recording|in-one|by-parts|monday-maps)\b": "takes minutes: tests/system/test_"
+    "reconstruct_parts.py",
     r"rig tradeoff|rig scan runs/": "takes minutes: tests/system/cli/test_cli_tradeoff.py",
     r"rig (scan lab|replay taken)": "devices are missing or take real time: tests/system/test_lab_emulated.py",
     r"rig .* /data/": "names folders of other computers",

@@ -122,7 +122,7 @@ def ending(target: Target, data: bytes) -> tuple[str, str, str | None]:
         signal.setitimer(signal.ITIMER_PROF, 0)
     grown = _peak_bytes() - before
     if grown > _FORGOTTEN_BYTES:
-        Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak begins anew
+        _forget_peak()
     if wrong is None and grown > MOST_BYTES + MOST_RATIO * len(data):
         name, wrong = "large", f"took {grown >> 20} MiB for {len(data)} bytes"
     return name, f"{name} {_form(text)}", wrong
@@ -135,6 +135,11 @@ def _peak_bytes() -> int:
     """
     status = Path("/proc/self/status").read_text("ascii")
     return 1024 * int(status.partition("VmHWM:")[2].split(None, 1)[0])
+
+
+def _forget_peak() -> None:
+    """Begin the peak of this process anew, at what it has now."""
+    Path("/proc/self/clear_refs").write_text("5", "ascii")
 
 
 def _unfit(error: Exception, text: str) -> str | None:
@@ -169,6 +174,7 @@ def fuzz(target: Target, inputs: int, seed: int, most_s: float = math.inf) -> Fo
     corpus = list(target.seeds())
     with suppress(*target.errors):
         target.parse(corpus[0])  # loads what is loaded once, which takes longer than any input may
+    _forget_peak()
     with strict():
         for data in corpus:
             name, shape, wrong = ending(target, data)

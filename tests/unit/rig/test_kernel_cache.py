@@ -2,9 +2,11 @@
 
 import errno
 import os
+import shutil
 import stat
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
@@ -139,6 +141,7 @@ def test_an_inlined_function_of_another_file_is_never_the_old_one(tree):
 
 _PROGRAM = """
 import sys
+from functools import partial
 import rig  # which forgives
 import numba
 
@@ -150,29 +153,38 @@ print(f(1), f(1.5) if "both" in sys.argv else "", sum(f.stats.cache_hits.values(
 """
 
 
-@pytest.fixture
-def kept(tmp_path):
-    """Kernels of a function for two types, and a call that runs it and gives what it prints."""
-    folder, program = tmp_path / "kernels", tmp_path / "program.py"
+def ran(program, folder, *arguments):
+    """What a program prints that keeps its kernels in a folder."""
+    environment = {**os.environ, kernel_cache.VARIABLE: str(folder), "PYTHONPATH": str(kernel_cache.TOP)}
+    done = subprocess.run(
+        [sys.executable, program, *arguments], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A program with a function, and the folder of its kernels for two types."""
+    place = tmp_path_factory.mktemp("compiled")
+    program, folder = place / "program.py", place / "kernels"
     program.write_text(_PROGRAM)
     folder.mkdir()
+    assert ran(program, folder, "both") == ["2", "2.5", "0"]
+    assert ran(program, folder, "both") == ["2", "2.5", "2"]
+    return program, folder
 
-    def run(*arguments, within=folder):
-        environment = {**os.environ, kernel_cache.VARIABLE: str(within), "PYTHONPATH": str(kernel_cache.TOP)}
-        done = subprocess.run(
-            [sys.executable, program, *arguments], env=environment, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout.split()
 
-    assert run("both") == ["2", "2.5", "0"]
-    assert run("both") == ["2", "2.5", "2"]
-    return folder, run
+@pytest.fixture
+def kept(compiled, tmp_path):
+    """A copy of these kernels, and a call that runs the program with them and gives what it prints."""
+    program, folder = compiled
+    copy = shutil.copytree(folder, tmp_path / "kernels")
+    return copy, partial(ran, program, copy)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("torn", [0, 100])
-@pytest.mark.parametrize("ending", ["nbi", "1.nbc"])
+@pytest.mark.parametrize(("ending", "torn"), [("nbi", 0), ("1.nbc", 100)])
 def test_a_torn_file_of_kernels_costs_time_and_no_command(kept, ending, torn):
     folder, run = kept
     (file,) = folder.rglob(f"*.{ending}")
@@ -192,10 +204,8 @@ def test_kernels_that_two_processes_have_mixed_up_are_not_called(kept):
 
 @pytest.mark.slow
 @posix
-def test_a_full_disk_keeps_no_kernels_and_stops_none(kept, tmp_path):
-    _, run = kept
-    limited = tmp_path / "limited.py"
-    limited.write_text(f"import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))\n{_PROGRAM}")
-    (tmp_path / "program.py").write_text(limited.read_text())
+def test_a_full_disk_keeps_no_kernels_and_stops_none(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(f"import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))\n{_PROGRAM}")
     (tmp_path / "full").mkdir()
-    assert run("both", within=tmp_path / "full") == ["2", "2.5", "0"]
+    assert ran(program, tmp_path / "full", "both") == ["2", "2.5", "0"]

@@ -100,7 +100,9 @@ def test_a_result_that_another_shard_writes_meanwhile_is_no_torn_one(
 
 def test_a_folder_of_other_cases_is_refused(tmp_path: Path) -> None:
     Store(tmp_path / "out", squares(3)).close()
-    with pytest.raises(UsageError, match=r"was begun with other cases: 3, of which 2 are the same; name a new folder"):
+    with pytest.raises(
+        UsageError, match=r"was begun with other cases: 3, of which 2 are the same; name another folder"
+    ):
         Store(tmp_path / "out", squares(2))
     labelled = [Case(each.function, each.inputs, {"other": 1}) for each in squares(3)]
     with pytest.raises(UsageError, match=r"was begun with other cases"):
@@ -122,7 +124,7 @@ def test_a_folder_of_other_code_or_of_other_packages_is_refused(
 ) -> None:
     Store(tmp_path / "out", squares(3)).close()
     monkeypatch.setattr(module, "code_digest", lambda package: "another")
-    with pytest.raises(UsageError, match=r"was begun with another version of the code; name a new folder"):
+    with pytest.raises(UsageError, match=r"was begun with another version of the code; name another folder"):
         Store(tmp_path / "out", squares(3))
     monkeypatch.setattr(module, "numeric_versions", lambda: {"numpy": "0.1"})
     with pytest.raises(UsageError, match=r"with other versions of packages: .*, here {'numpy': '0.1'}"):
