@@ -124,18 +124,15 @@ def run_batch(
         aborted = True
     finally:
         executor.close()
-        total = len(store.cases)
-        there, packed = None, shard[1] == 1
-        if not packed:
-            there = store.finished()
-            packed = len(there) == total and store.alone()
+        total, only = len(store.cases), shard[1] == 1
+        there = set() if only else store.finished()
+        packed = only or (len(there) == total and store.alone())
         if packed:
             try:
                 there = store.pack()
             except OSError as error:
-                packed = False
+                there, packed = store.finished(), False
                 runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
-        there = store.finished() if there is None else there
         done = len(there)
     for name in runs.done - there:
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")

@@ -140,8 +140,9 @@ class SweepWatch:
 
     def finish(self, leg: int = 0) -> tuple[str, ...]:
         """Doubts about the sweep, at most one; the next one begins. leg: the sweep's."""
+        skipped = self._sweeps % self._every
         self._sweeps += 1
-        if (self._sweeps - 1) % self._every:
+        if skipped:
             return ()
         try:
             return self._mixed() or self._late(leg) or self._torn()

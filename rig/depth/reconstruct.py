@@ -34,8 +34,8 @@ class MapResult:
     is no depth, which is everywhere without a calibration.
     compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
     nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`) and frames
-    (`rig.count.sweep_watch`). floating:
-    number of points left out because they float between two surfaces; None if such points are kept, or without depth.
+    (`rig.count.sweep_watch`). floating: number of points left out because they float between two surfaces; None if such
+    points are kept, or without depth.
     """
 
     stripe: StripeTable

@@ -57,9 +57,9 @@ PROTECTED: Final = "simulation for comparison only"
 class ComparisonPlan:
     """Scenes, air, times and rules of a comparison.
 
-    scenes: bundled names, files or folders, by the names that they have in the table. airs: fog,
-    rain, snow or clear air; None for a scene's own. times_s: time of a measurement. rows: number of image rows, from
-    the middle of the picture. lux: ambient light; None for each scene's own.
+    scenes: bundled names, files or folders, by the names that they have in the table. airs: fog, rain, snow or clear
+    air; None for a scene's own. times_s: time of a measurement. rows: number of image rows, from the middle of the
+    picture. lux: ambient light; None for each scene's own.
     """
 
     scenes: Mapping[str, str]

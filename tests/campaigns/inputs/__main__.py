@@ -48,7 +48,7 @@ def main() -> int:
         parser.error(f"no parser {unknown[0]!r}; choose all or one of {', '.join(TARGETS)}")
     if asked.guided is not None:  # ends this process, so one parser at a time
         (name,) = names[:1]
-        told = partial(_told, name, asked.keep)
+        told = partial(_told, name, asked.keep, time.process_time())
         fuzz_guided(TARGETS[name], asked.inputs, asked.seed, asked.seconds, asked.guided / name, told)
     seconds = None if math.isinf(asked.seconds) else asked.seconds
     fixed = {"inputs": asked.inputs, "seed": asked.seed, "seconds": seconds}
@@ -81,8 +81,8 @@ def _counts(found: Any) -> dict[str, Any]:
     }
 
 
-def _told(name: str, keep: Path | None, found: Any) -> None:
-    _tell(name, {**_counts(found), "measured": {"cpu_s": time.process_time()}}, keep)
+def _told(name: str, keep: Path | None, begun_s: float, found: Any) -> None:
+    _tell(name, {**_counts(found), "measured": {"cpu_s": time.process_time() - begun_s}}, keep)
 
 
 def _tell(name: str, result: dict[str, Any], keep: Path | None) -> None:

@@ -159,26 +159,28 @@ def other_calibration(setting: Setting) -> Wrong:
 
 def baseline_off(setting: Setting) -> Wrong:
     """A baseline 3 % too long or too short."""
-    factor = float(setting.rng.choice([0.97, 1.03]))
-    return _of_calibration(setting, f"baseline x {factor}", changed(setting.geometry, baseline=factor))
+    return _of_calibration(setting, *_scaled(setting, "baseline", 0.03))
 
 
 def focal_length_off(setting: Setting) -> Wrong:
     """A focal length 2 % too long or too short."""
-    factor = float(setting.rng.choice([0.98, 1.02]))
-    return _of_calibration(setting, f"focal length x {factor}", changed(setting.geometry, focal=factor))
+    return _of_calibration(setting, *_scaled(setting, "focal length", 0.02))
 
 
 def baseline_off_before(setting: Setting) -> Wrong:
     """A rig whose baseline is not that of its calibration, which was wrong before the recording was taken."""
-    factor = float(setting.rng.choice([0.97, 1.03]))
-    return _of_world(setting, f"baseline x {factor}", changed(setting.geometry, baseline=factor))
+    return _of_world(setting, *_scaled(setting, "baseline", 0.03))
 
 
 def focal_length_off_before(setting: Setting) -> Wrong:
     """A rig whose focal length is not that of its calibration, which was wrong before the recording was taken."""
-    factor = float(setting.rng.choice([0.98, 1.02]))
-    return _of_world(setting, f"focal length x {factor}", changed(setting.geometry, focal=factor))
+    return _of_world(setting, *_scaled(setting, "focal length", 0.02))
+
+
+def _scaled(setting: Setting, length: str, by: float) -> tuple[str, Content]:
+    """In words and as a geometry: a rig one of whose lengths is larger or smaller by a share."""
+    factor = float(setting.rng.choice([1 - by, 1 + by]))
+    return f"{length} x {factor}", changed(setting.geometry, **{length.split()[0]: factor})
 
 
 def mirror_reversed(setting: Setting) -> Wrong:
