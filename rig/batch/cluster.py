@@ -67,9 +67,9 @@ class Cluster:
         self._threads = 0
         self._looked_s = float("-inf")
         self._with_workers_s = time.monotonic()
-        self._retired: set[str] = set()
-        self.notes: list[str] = []
-        """Sentences on workers that were retired."""
+        self._retired: dict[str, str] = {}
+        self._seen: set[str] = set()
+        self._gone: set[str] = set()
         try:
             _require_able(client, store)
         except BaseException:
@@ -85,6 +85,9 @@ class Cluster:
             try:
                 connected = self._client.status == "running"
                 threads = self._client.nthreads() if connected else {}
+                if connected:
+                    self._gone |= self._seen - set(threads)
+                    self._seen |= set(threads)
                 # A worker that holds something which no other can take stays there, retired or not.
                 self._threads = sum(number for each, number in threads.items() if each not in self._retired)
             except (OSError, TimeoutError):
@@ -92,6 +95,15 @@ class Cluster:
             if self._threads:
                 self._with_workers_s = now_s
         return self._threads
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on workers that were retired, or that went away."""
+        notes = list(dict.fromkeys(self._retired.values()))
+        if gone := len(self._gone - set(self._retired)):
+            who = "a worker" if gone == 1 else f"{gone} workers"
+            notes.append(f"{who} went away, and others were given the cases")
+        return notes
 
     @property
     def room(self) -> int:
@@ -113,7 +125,7 @@ class Cluster:
         workers."""
         if self._client.status == "closed":
             raise RigError("the scheduler is gone; start it, then run this again: it goes on where it stopped")
-        if self.notes and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
+        if self._retired and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
             raise UsageError("no worker is left", *self.notes)
         ended: list[tuple[str, Future[Any]]] = []
         try:
@@ -146,11 +158,10 @@ class Cluster:
         if ended.status not in ("other code", "no folder"):
             return ended
         note = f"worker {ended.worker} was retired: {ended.message}"
-        if note not in self.notes:
-            self.notes.append(note)
-            _log.warning("%s", note)
         address = ended.worker.partition(" ")[0]
-        self._retired.add(address)
+        if address not in self._retired:
+            _log.warning("%s", note)
+        self._retired[address] = note
         with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
             self._client.retire_workers([address], close_workers=True)
         return Ended(ended.name, "lost", note)

@@ -5,11 +5,11 @@ is written with all results that there are.
 """
 
 import contextlib
-import statistics
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, Final, Literal, Protocol
 
 from rig.batch.store import FAILURES, Store, failure_files
@@ -109,7 +109,7 @@ def run_batch(
 
     shard: (i, n), only cases i, i + n, i + 2 n, ...; progress: called with the number of finished cases and of all.
     command: of the whole batch, for the commands that repeat a failed case. An interrupt ends the batch, with verdict
-    'aborted'; it is raised again if there is no result at all.
+    'aborted'.
     """
     begun = time.monotonic()
     mine = list(store.cases)[shard[0] :: shard[1]]
@@ -149,8 +149,6 @@ def run_batch(
             old.unlink(missing_ok=True)
         if failures:
             replace_file(file, "".join(json_line(asdict(failure)) for failure in failures).encode())
-    if aborted and not done:
-        raise KeyboardInterrupt
     verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
     if aborted:
         verdict = "aborted"
@@ -265,13 +263,16 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
-def probe(scratch: Store, executor: Executor, most: int = 3) -> float:
-    """Mean wall time of a case in seconds, measured with a few cases that are spread over the batch.
+def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
+    """Wall times of a few cases in seconds.
 
     scratch: a store of all cases, in a folder that nobody needs. Raises UsageError if one of them fails.
     """
     names = list(scratch.cases)
-    some = list(dict.fromkeys(names[(2 * i + 1) * len(names) // (2 * most)] for i in range(most)))
+    # One of each part of the list, and any of it: their names are digests. With equal steps through a list that goes
+    # around a few settings, all cases tried could have the same one.
+    ends = [i * len(names) // most for i in range(most + 1)]
+    some = [min(names[first:end]) for first, end in pairwise(ends) if first < end]
     runs = _Runs(scratch, executor, some, 0)
     try:
         for _ in runs.steps():
@@ -283,5 +284,4 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> float:
         if first.status == "other code":
             raise UsageError("the program was changed while cases were tried; run the command again")
         raise UsageError(f"case {first.name} fails: {first.message}")
-    times_s = runs.times_s[1:] or runs.times_s  # in the first one the process loads compiled code
-    return statistics.fmean(times_s)
+    return runs.times_s[1:] or runs.times_s  # in the first one the process loads compiled code

@@ -66,7 +66,7 @@ class Pool:
         self.workers = usual_workers(limits) if workers is None else workers
         share = int((1 - KEPT_FREE) * memory_bytes() / self.workers)
         self._limits = Limits(limits.time_s, limits.memory_bytes or share)
-        self.notes: list[str] = []
+        self._replaced = 0
         self._idle = [f"{name} {number}" for number in range(self.workers, 0, -1)]
         self._free: list[_Process] = []
         self._busy: list[_Process] = []
@@ -75,6 +75,12 @@ class Pool:
     def room(self) -> int:
         """Number of tasks that can be begun now."""
         return self.workers - len(self._busy)
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence on processes that had to be replaced, if there were any."""
+        what = "a process" if self._replaced == 1 else f"{self._replaced} processes"
+        return [f"{what} died, hung or took too much memory, replaced by another"] if self._replaced else []
 
     def submit(self, task: Task) -> None:
         """Begin a task; only if there is room."""
@@ -98,6 +104,7 @@ class Pool:
             if process.alive:
                 self._free.append(process)
             else:
+                self._replaced += 1
                 self._idle.append(process.name)
         return ended
 

@@ -98,9 +98,10 @@ def _show_values(result: "Result") -> None:
 def _show_plan(plan: "BatchPlan") -> None:
     from rig.batch.engine import in_words
 
-    tell(f"{plan.cases} cases, {plan.left} of them to be done")
+    tell(f"cases: {plan.cases}, to be done: {plan.left}")
     if plan.left:
-        tell(f"a case takes {plan.case_s:.2g} s: {in_words(plan.wall_s)} with {plan.workers} at once")
+        times = " and ".join(f"{seconds:.2g} s" for seconds in sorted(plan.tried_s))
+        tell(f"about {in_words(plan.wall_s)} with {plan.workers} at once, since cases that were tried took {times}")
 
 
 def _show_batch(done: "BatchResult") -> None:
@@ -116,7 +117,7 @@ def _show_batch(done: "BatchResult") -> None:
         say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / 'failures.jsonl'}")
     tell(
         f"{batch.verdict}: {batch.done} of {batch.total} cases done, {batch.run} of them now, in "
-        f"{in_words(batch.wall_s)} with {batch.workers} at once"
+        f"{in_words(batch.wall_s)} with up to {batch.workers} at once"
     )
     if batch.reason:
         say(batch.reason)

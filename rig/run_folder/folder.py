@@ -11,6 +11,7 @@ recording is there from the start and grows in place. Data written with `replace
 loss of power.
 """
 
+import contextlib
 import io
 import logging
 import os
@@ -224,8 +225,9 @@ class RunFolder:
             raise _taken(self.path)
         missing = [folder for folder in self.path.parents if not folder.exists()]
         for folder in [*reversed(missing), *([self.path] if self._in_place and not there else ())]:
-            folder.mkdir()
-            self._made_parents.append(folder)
+            with contextlib.suppress(FileExistsError):  # another run has just made it
+                folder.mkdir()
+                self._made_parents.append(folder)
         if self._in_place:
             try:
                 (self.path / CLAIM_FILE).open("xb").close()

@@ -1,8 +1,10 @@
 """The calls that do studies, on this computer or on many: `batch`, `plan_batch`, `repeat_case`."""
 
 import os
+import re
 import shlex
 import shutil
+import statistics
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -55,7 +57,8 @@ class BatchPlan:
     """The work that a study would be.
 
     cases, left: number of all cases, and of those without a result. workers: cases at once, on this computer. case_s:
-    mean wall time of a case in seconds, with one thread, found by trying a few. wall_s: of all that are left.
+    mean wall time of a case in seconds, with one thread, found by trying a few. tried_s: time of each that was tried.
+    wall_s: of all that are left.
     """
 
     cases: int
@@ -63,6 +66,7 @@ class BatchPlan:
     workers: int
     case_s: float
     wall_s: float
+    tried_s: tuple[float, ...] = ()
 
 
 def batch(
@@ -122,8 +126,9 @@ def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes:
         if request.out is not None and Path(request.out).exists():
             store = stack.enter_context(Store(Path(request.out), made.cases, {"study": loaded.model_dump(mode="json")}))
             left -= len(store.finished())
-        case_s = probe(scratch, Pool(1, limits)) if left else 0.0
-    return BatchPlan(total, left, workers, case_s, case_s * left / workers)
+        tried_s = probe(scratch, Pool(1, limits)) if left else [0.0]
+    case_s = statistics.fmean(tried_s)
+    return BatchPlan(total, left, workers, case_s, case_s * left / workers, tuple(tried_s))
 
 
 def repeat_case(study: StudyLike, name: str) -> Result:
@@ -153,6 +158,19 @@ class _Made:
 
 
 def _made(study: Study) -> _Made:
+    try:
+        return _cases_and_table(study)
+    except UsageError as error:
+        raise UsageError.of(map(_in_settings, error.problems)) from error
+
+
+def _in_settings(text: str) -> str:
+    """A problem that names an argument, `times`, with the name that it has in a study: time."""
+    names = {field: setting for setting, field in _FIELDS.items()}
+    return re.sub("`([a-z_]+)`", lambda found: names.get(found[1], found[1]), text)
+
+
+def _cases_and_table(study: Study) -> _Made:
     if study.do not in ("tradeoff", "strategies"):
         return _Made(cases_of(study))
     lists: dict[str, list[Any]] = {**{key: [value] for key, value in study.set.items()}, **study.vary}

@@ -25,7 +25,7 @@ from rig.errors import RigError, UsageError
 from rig.estimate.registry import LEARNING
 from rig.geometry.stripe_table import StripeTable
 from rig.plan.calibration_reach import recalibrated
-from rig.progress import Progress
+from rig.progress import Progress, tell_stage
 from rig.recording.cut import cut
 from rig.recording.inputs import read_plan
 from rig.recording.open import map_spans, open_recording
@@ -81,13 +81,17 @@ def reconstruct_parts(
         )
         for first in range(0, maps, MAPS_OF_A_PART)
     ]  # fmt: skip
+    if len(cases) == 1:
+        tell_stage(f"one part, since there are no more than {MAPS_OF_A_PART} maps: one process does it all")
     place = out.with_name(f"{out.name}.parts")
     asked = BatchRequest(out=place, cluster=cluster, workers=workers)
     with RunFolder(out) as target:  # claimed first: it may be impossible
         with Store(place, cases) as store:
             done = run_batch(store, executor_of(asked, store, Limits(), client), progress=progress)
             if done.verdict == "aborted":
-                raise KeyboardInterrupt
+                interrupt = KeyboardInterrupt()
+                interrupt.add_note(f"{done.done} of {done.total} parts are done; run the same command again to go on")
+                raise interrupt
             if done.verdict != "complete":
                 said = done.reason or f"maps {done.failures[0].labels['maps']}: {done.failures[0].message}"
                 raise RigError(f"{len(done.failures)} of {done.total} parts failed; {said}")

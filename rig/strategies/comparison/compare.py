@@ -70,6 +70,30 @@ class ComparisonPlan:
     lux: float | None
     seeds: range
 
+    def parts(self) -> list["Part"]:
+        """The parts that are measured independently, in the table's order."""
+        return [
+            Part(name, scene, air, rule, time_s, self.rows, self.lux, self.seeds)
+            for (name, scene), air, rule, time_s in product(self.scenes.items(), self.airs, self.rules, self.times_s)
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a comparison: all strategies in one scene and air, by one rule and in one time.
+
+    name: of the scene in the table. The other fields are as in `ComparisonPlan`.
+    """
+
+    name: str
+    scene: str
+    air: str | None
+    rule: Rule
+    time_s: float
+    rows: int
+    lux: float | None
+    seeds: range
+
 
 @dataclass(frozen=True, slots=True)
 class StrategyRow:
@@ -153,13 +177,13 @@ def run_comparison(
     """
     rows: list[StrategyRow] = []
     verdict: Literal["complete", "aborted"] = "complete"
-    total = len(ways) * len(asked.scenes) * len(asked.airs) * len(asked.times_s) * len(asked.rules)
+    parts = asked.parts()
     try:
-        for one in _parts(asked):
+        for one in parts:
             for row in _rows(config, ways, one):
                 rows.append(row)
                 if progress is not None:
-                    progress(len(rows), total)
+                    progress(len(rows), len(ways) * len(parts))
     except KeyboardInterrupt:
         if not rows:
             raise
@@ -167,30 +191,23 @@ def run_comparison(
     return _comparison(ways, rows, verdict)
 
 
-def _parts(asked: ComparisonPlan) -> Iterator[ComparisonPlan]:
-    """The parts of a comparison that are independent: one scene, air, rule and time each."""
-    for scene, air, rule, time_s in product(asked.scenes.items(), asked.airs, asked.rules, asked.times_s):
-        yield replace(asked, scenes=dict([scene]), airs=[air], rules=[rule], times_s=[time_s])
-
-
 def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
-    """A case for each scene, air, rule and time, with all strategies."""
+    """A case for each part, with all strategies."""
     content, names = portable_content(config), [way.name for way in ways]
     cases = []
-    for one in _parts(asked):
-        ((name, scene),) = one.scenes.items()
-        file = str(Path(scene).absolute()) if Path(scene).exists() else scene
-        plan = {**asdict(replace(one, scenes={name: file})), "seeds": [asked.seeds.start, asked.seeds.stop]}
-        labels = {"scene": scene, "air": one.airs[0], "rule": one.rules[0], "time_ms": 1e3 * one.times_s[0]}
-        inputs = {"config": content, "ways": names, "plan": plan}
+    for one in asked.parts():
+        file = str(Path(one.scene).absolute()) if Path(one.scene).exists() else one.scene
+        plain = {**asdict(one), "scene": file, "seeds": [one.seeds.start, one.seeds.stop]}
+        labels = {"scene": one.scene, "air": one.air, "rule": one.rule, "time_ms": 1e3 * one.time_s}
+        inputs = {"config": content, "ways": names, "one": plain}
         cases.append(Case(f"{__name__}:measure_once", inputs, labels, files_of(content, file)))
     return cases
 
 
-def measure_once(config: Mapping[str, Any], ways: Sequence[str], plan: Mapping[str, Any]) -> dict[str, Any]:
+def measure_once(config: Mapping[str, Any], ways: Sequence[str], one: Mapping[str, Any]) -> dict[str, Any]:
     """The rows of a part of a comparison as a case: plain values, with the computing times apart."""
-    asked = ComparisonPlan(**{**plan, "seeds": range(*plan["seeds"])})
-    rows = list(_rows(RigConfig.model_validate(config), [find_strategy(name) for name in ways], asked))
+    made = Part(**{**one, "seeds": range(*one["seeds"])})
+    rows = list(_rows(RigConfig.model_validate(config), [find_strategy(name) for name in ways], made))
     return {
         "rows": [{key: value for key, value in asdict(row).items() if key != "compute_s"} for row in rows],
         "measured": {"compute_s": [row.compute_s for row in rows]},
@@ -217,26 +234,22 @@ def _comparison(
     return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], one: ComparisonPlan) -> Iterator[StrategyRow]:
+def _rows(config: RigConfig, ways: Sequence[Strategy], one: Part) -> Iterator[StrategyRow]:
     """The rows of a part of a comparison."""
-    ((name, scene),), air = one.scenes.items(), one.airs[0]
-    with part(name if air is None else f"{name}, {air}"), TemporaryDirectory() as made:
+    with part(one.name if one.air is None else f"{one.name}, {one.air}"), TemporaryDirectory() as made:
         tell_stage("making the scene")
         model = rig_model(config)
-        file = scene_file(scene, air, one.lux, model, Path(made))
-        yield from _of_place(configure(config, scene=str(file)), model, ways, one, (name, air))
+        file = scene_file(one.scene, one.air, one.lux, model, Path(made))
+        yield from _in_scene(configure(config, scene=str(file)), model, ways, one)
 
 
-def _of_place(
-    config: RigConfig, model: RigModel, ways: Sequence[Strategy], asked: ComparisonPlan, place: tuple[str, str | None]
-) -> Iterator[StrategyRow]:
-    """The rows of one scene and air, by one rule and in one time."""
-    rule, time_s = asked.rules[0], asked.times_s[0]
-    scan = config.scan
+def _in_scene(config: RigConfig, model: RigModel, ways: Sequence[Strategy], one: Part) -> Iterator[StrategyRow]:
+    """The rows of a part of a comparison, whose scene and air are those of the config."""
+    rule, time_s, scan = one.rule, one.time_s, config.scan
     columns = scan.columns // LINES * LINES
     commands = np.array([column_command(column, scan.command_range, columns) for column in range(columns)])
     height = model.camera.height
-    measured = min(asked.rows, height)
+    measured = min(one.rows, height)
     rows = np.arange(measured) + (height - measured) // 2
     geometry = ColumnGeometry(model, commands, scan.depth_range, rows)
     frame_s = float(1 / scan.frame_rate)
@@ -248,7 +261,7 @@ def _of_place(
         scored = scored_pixels(truth, geometry)
         true_m = truth.depth_m[rows][scored]
         if not scored.any():
-            raise UsageError(f"scene {place[0]}: the source lights nothing that the camera sees; check the scene")
+            raise UsageError(f"scene {one.name}: the source lights nothing that the camera sees; check the scene")
 
         def apparatus_of(seed: int) -> Apparatus:
             try:
@@ -257,7 +270,7 @@ def _of_place(
                     depth_range_m=scan.depth_range, spad_frame_s=frame_s,
                 )  # fmt: skip
             except DeviceError as error:
-                raise UsageError(f"scene {place[0]}: {error}") from error
+                raise UsageError(f"scene {one.name}: {error}") from error
             except ValueError as error:  # the config asks for what no apparatus has
                 raise UsageError(f"{config.name}: {error}") from error
             return made
@@ -279,10 +292,10 @@ def _of_place(
                 )
             return answer, spent
 
-        apparatus_of(asked.seeds[0])  # light that all ways share is on nobody's computing time
+        apparatus_of(one.seeds[0])  # light that all ways share is on nobody's computing time
         for way in ways:
             tell_stage(f"{way.name}, {time_s * 1e3:g} ms")
-            row = StrategyRow(way.name, way.light, *place, rule, 1e3 * time_s, len(true_m))
+            row = StrategyRow(way.name, way.light, one.name, one.air, rule, 1e3 * time_s, len(true_m))
             classes = _classes(config, geometry, way.light, power_w, rule, time_s)
             row = replace(row, laser_class=classes[0], laser_class_still=classes[1])
             begun = time.perf_counter()
@@ -290,7 +303,7 @@ def _of_place(
             reached = Reached(true_m)
             spent: list[tuple[float, float]] = []
             try:
-                for seed in asked.seeds:
+                for seed in one.seeds:
                     answer, used = measure(way, seed)
                     spent.append((used.time_s, used.energy_j))
                     scores.append(score(answer, truth, geometry, scored))

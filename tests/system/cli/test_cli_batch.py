@@ -158,7 +158,8 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     Path("study.yaml").write_text(yaml.safe_dump(content))
     planned = rig("batch", "study.yaml", "--out", "study", "--dry-run")
     assert planned.code == 0
-    assert "1 cases, 1 of them to be done" in planned.out
+    assert "cases: 1, to be done: 1" in planned.out
+    assert "since cases that were tried took " in planned.out
     assert not Path("study").exists()
     ran = rig("batch", "study.yaml", "--out", "study", "--json")
     assert ran.code == 0, ran.err
@@ -174,6 +175,34 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
         "error: the study has no case 'nonsense'; its names are in cases.jsonl, and change with the study and the code"
     ]
     assert "complete: 1 of 1 cases done, 0 of them now" in rig("batch", "study.yaml", "--out", "study").out
+
+
+@pytest.mark.parametrize(
+    ("study", "said"),
+    [
+        ({"do": "strategies", "vary": {"time": ["5 m"]}}, "error: time "),
+        ({"do": "strategies", "vary": {"rule": ["fair"]}}, "error: rule has 'fair'; the rules are energy and irr"),
+        ({"do": "tradeoff", "set": {"exposures": 60_000}}, "leave out exposures above"),
+    ],
+)
+def test_a_wrong_setting_has_its_name_in_the_study(rig: Rig, study: dict[str, Any], said: str) -> None:
+    Path("study.yaml").write_text(yaml.safe_dump({**study, "set": {"config": "small", **study.get("set", {})}}))
+    refused = rig("batch", "study.yaml", "--out", "study")
+    assert (refused.code, len(refused.problems)) == (2, 1)
+    assert said in refused.problems[0]
+
+
+def test_an_interrupt_before_the_first_result_says_how_to_go_on(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(task: Any) -> None:
+        raise KeyboardInterrupt
+
+    Path("study.yaml").write_text(yaml.safe_dump({**SCAN, "repeat": 1}))
+    monkeypatch.setattr(batches, "executor_of", lambda *given: Inline(interrupt))
+    ran = rig("batch", "study.yaml", "--out", "study")
+    assert "aborted: 0 of 2 cases done" in ran.out
+    assert "run the same command again to go on" in ran.err
+    monkeypatch.setattr(batches, "executor_of", lambda *given: Inline())
+    assert "complete: 2 of 2 cases done" in rig("batch", "study.yaml", "--out", "study").out
 
 
 def test_failures_are_named_with_the_command_that_repeats_them(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -229,6 +229,7 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
                 done = run_batch(store, Cluster(store, client), progress=kill, retries=0)
             assert killed != []
             assert (done.verdict, done.done, done.failures) == ("complete", 20, ())
+            assert done.notes == ("a worker went away, and others were given the cases",)
     finally:
         for process in reversed(started):
             process.kill()

@@ -177,12 +177,12 @@ def test_an_interrupt_keeps_a_whole_table_and_is_resumed(tmp_path: Path) -> None
     assert table(tmp_path / "out") == table(tmp_path / "undisturbed")
 
 
-def test_an_interrupt_before_the_first_result_is_passed_on(tmp_path: Path) -> None:
+def test_an_interrupt_before_the_first_result_is_resumed(tmp_path: Path) -> None:
     def interrupt(task: Task) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "out", Inline(interrupt))
+    done = run(tmp_path / "out", Inline(interrupt))
+    assert (done.verdict, done.done, done.total) == ("aborted", 0, 7)
     assert run(tmp_path / "out").verdict == "complete"
 
 
@@ -254,8 +254,8 @@ def test_times_are_in_words(seconds: float, words: str) -> None:
 def test_a_probe_tries_a_few_cases_spread_over_the_batch(tmp_path: Path) -> None:
     executor = Inline()
     with Store(tmp_path / "out", squares(90)) as store:
-        assert probe(store, executor) >= 0
-        assert sorted(store.names.index(name) for name in executor.given) == [15, 45, 75]
+        assert len(probe(store, executor)) == 2, "the first one loads compiled code"
+        assert sorted(store.names.index(name) // 30 for name in executor.given) == [0, 1, 2]
         assert not result_file(tmp_path / "out", store.names[0]).exists()
     assert executor.closed
     with Store(tmp_path / "bad", squares(2)) as store, pytest.raises(UsageError, match=r"case .* fails: it raised"):

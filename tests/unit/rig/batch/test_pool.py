@@ -53,6 +53,7 @@ def test_a_case_that_dies_once_is_done_by_another_process(tmp_path: Path) -> Non
     cases = troubles("die", tmp_path / "counts", (1, 2, 3), times=1)
     done = run(tmp_path / "out", cases, Limits(), retries=1)
     assert (done.verdict, done.done) == ("complete", 3)
+    assert done.notes == ("3 processes died, hung or took too much memory, replaced by another",)
 
 
 def test_processes_have_one_thread_each_and_are_used_again(tmp_path: Path) -> None:

@@ -225,6 +225,22 @@ def test_a_folder_that_grows_in_place_is_claimed_before_anything_is_in_it(tmp_pa
     assert [file.name for file in (tmp_path / "views").iterdir()] == ["view"]
 
 
+def test_two_runs_may_make_the_folder_above_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Path.mkdir
+
+    def other_first(folder: Path) -> None:
+        monkeypatch.setattr(Path, "mkdir", made)
+        folder.mkdir()
+        (folder / "other").mkdir()
+        folder.mkdir()
+
+    monkeypatch.setattr(Path, "mkdir", other_first)
+    with RunFolder(tmp_path / "runs" / "mine") as folder:
+        folder.write_text("note.txt", "mine")
+        folder.publish()
+    assert sorted(each.name for each in (tmp_path / "runs").iterdir()) == ["mine", "other"]
+
+
 def test_an_empty_folder_is_filled_stays_when_nothing_comes_of_it_and_is_left_to_who_was_faster(tmp_path: Path) -> None:
     out = tmp_path / "run"
     out.mkdir()
