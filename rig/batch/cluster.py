@@ -42,6 +42,8 @@ ANSWER_S: Final = 10.0
 """Seconds in which a scheduler answers at first."""
 LOOK_S: Final = 1.0
 """Seconds from one count of the workers to the next."""
+JOB_OVER_S: Final = 30.0
+"""Seconds without any of its workers after which a job counts as over: one that has crashed starts again sooner."""
 MOST_NAMED: Final = 5
 
 _of_thread = threading.local()
@@ -51,15 +53,21 @@ _log = logging.getLogger(__name__)
 class Cluster:
     """An executor with the workers of a dask cluster; see `rig.batch.engine.Executor`.
 
-    client: the caller's own, which stays open. close: what else is to be closed. Raises UsageError if a worker that is
-    there already cannot do the cases.
+    client: the caller's own, which stays open. close: what else is to be closed. looked: called each time the workers
+    have been counted. Raises UsageError if a worker that is there already cannot do the cases.
     """
 
     def __init__(
-        self, store: Store, client: "Client", limits: Limits | None = None, *, close: Callable[[], object] | None = None
+        self,
+        store: Store,
+        client: "Client",
+        limits: Limits | None = None,
+        *,
+        close: Callable[[], object] | None = None,
+        looked: Callable[[], object] | None = None,
     ) -> None:
         self._client = client
-        self._close = close
+        self._close, self._looked = close, looked
         self._limits = limits or Limits()
         self._ended: SimpleQueue[tuple[str, Future[Any]]] = SimpleQueue()
         self._under_way: dict[str, Future[Any]] = {}
@@ -94,6 +102,8 @@ class Cluster:
                 self._threads = 0
             if self._threads:
                 self._with_workers_s = now_s
+            if self._looked is not None:
+                self._looked()
         return self._threads
 
     @property
@@ -147,7 +157,8 @@ class Cluster:
     def close(self) -> None:
         """Give up what is under way, and close what was opened for this executor."""
         if self._client.status == "running" and self._under_way:
-            self._client.cancel(list(self._under_way.values()), force=True)
+            with contextlib.suppress(OSError, TimeoutError):
+                self._client.cancel(list(self._under_way.values()), force=True)
         self._under_way.clear()
         if self._close is not None:
             self._close()
@@ -181,14 +192,41 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
         except (OSError, TimeoutError, ValueError) as error:
             raise UsageError(f"no scheduler answers at {cluster} ({error}); start one with `dask scheduler`") from error
         return Cluster(store, client, limits, close=client.close)
-    queue = _batch_system(Path(cluster))
+    queue, jobs = _batch_system(Path(cluster))
     client = distributed.Client(queue, timeout=PATIENCE_S, set_as_default=False)
 
     def close() -> None:
         client.close()
         queue.close()
 
-    return Cluster(store, client, limits, close=close)
+    return Cluster(store, client, limits, close=close, looked=Jobs(queue, jobs).renew)
+
+
+class Jobs:
+    """The jobs of a batch system, kept at their number: where the time of one is over, another is asked for.
+
+    dask-jobqueue itself replaces no job that has ended, so that a batch would wait for ever once all of them had. A job
+    that never had a worker is not replaced: it is still in the queue, or fails each time.
+    """
+
+    def __init__(self, queue: Any, number: int) -> None:
+        self._queue, self._number = queue, number
+        self._worked_s: dict[str, float] = {}
+
+    def renew(self) -> None:
+        """Ask for other jobs in the place of those that are over."""
+        now_s = time.monotonic()
+        workers = [str(each["name"]) for each in list(self._queue.scheduler_info["workers"].values())]
+        over = []
+        for job in list(self._queue.worker_spec):
+            if any(worker == job or worker.startswith(f"{job}-") for worker in workers):
+                self._worked_s[job] = now_s
+            elif now_s - self._worked_s.get(job, now_s) > JOB_OVER_S:
+                over.append(job)
+        for job in over:
+            del self._queue.worker_spec[job], self._worked_s[job]
+        if over:
+            self._queue.scale(jobs=self._number)
 
 
 def _require_answer(address: str) -> None:
@@ -212,8 +250,8 @@ SYSTEMS: Final = {
 """Batch systems, by the class of dask-jobqueue; `local` starts the jobs as processes of this computer, for trials."""
 
 
-def _batch_system(file: Path) -> Any:
-    """The jobs that a file describes, as a cluster of dask-jobqueue. Raises UsageError."""
+def _batch_system(file: Path) -> tuple[Any, int]:
+    """The jobs that a file describes, as a cluster of dask-jobqueue, and their number. Raises UsageError."""
     try:
         content = dict(load_yaml(file, "a cluster", "system: slurm").content)
     except FileError as error:
@@ -239,7 +277,7 @@ def _batch_system(file: Path) -> Any:
     except (TypeError, ValueError) as error:
         raise UsageError(f"{file}: {error}; its other keys are those of dask_jobqueue.{name}") from error
     made.scale(jobs=jobs)
-    return made
+    return made, jobs
 
 
 def _on_worker(task: Task, limits: Limits) -> Ended:

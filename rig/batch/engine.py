@@ -123,7 +123,10 @@ def run_batch(
     except KeyboardInterrupt:
         aborted = True
     finally:
-        executor.close()
+        try:
+            executor.close()
+        except KeyboardInterrupt:  # a second one, as `timeout` sends it and impatient people do
+            aborted = True
         total, only = len(store.cases), shard[1] == 1
         there = set() if only else store.finished()
         packed = only or (len(there) == total and store.alone())

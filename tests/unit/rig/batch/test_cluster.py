@@ -9,13 +9,14 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from rig.batch import cluster as module
 from rig.batch.case import Case, checksum
-from rig.batch.cluster import Cluster, connect
+from rig.batch.cluster import JOB_OVER_S, Cluster, Jobs, connect
 from rig.batch.engine import Batch, run_batch
 from rig.batch.pool import Limits
 from rig.batch.store import Store
@@ -234,6 +235,30 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
         for process in reversed(started):
             process.kill()
             process.wait()
+
+
+def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    workers = {"tcp://1": {"name": "S-1-0"}, "tcp://2": {"name": "S-1-1"}, "tcp://3": {"name": "S-10"}}
+    queue = SimpleNamespace(
+        worker_spec={"S-1": {}, "S-10": {}, "S-2": {}}, scheduler_info={"workers": workers},
+        scale=lambda jobs: asked.append(jobs),
+    )  # fmt: skip
+    now_s = [100.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    jobs = Jobs(queue, 3)
+    jobs.renew()
+    del workers["tcp://1"]
+    now_s[0] += 1000
+    jobs.renew()
+    del workers["tcp://2"]
+    now_s[0] += JOB_OVER_S - 1
+    jobs.renew()
+    assert asked == [], "one of its workers was there, and one job is still in the queue"
+    now_s[0] += 2
+    jobs.renew()
+    jobs.renew()
+    assert (asked, list(queue.worker_spec)) == ([3], ["S-10", "S-2"])
 
 
 def test_a_task_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:

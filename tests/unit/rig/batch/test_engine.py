@@ -186,6 +186,23 @@ def test_an_interrupt_before_the_first_result_is_resumed(tmp_path: Path) -> None
     assert run(tmp_path / "out").verdict == "complete"
 
 
+def test_a_second_interrupt_while_workers_are_ended_leaves_the_table_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(task: Task) -> None:
+        if len(executor.given) > 5:
+            raise KeyboardInterrupt
+
+    def again() -> None:
+        raise KeyboardInterrupt
+
+    executor = Inline(interrupt)
+    monkeypatch.setattr(executor, "close", again)
+    done = run(tmp_path / "out", executor)
+    assert (done.verdict, done.done) == ("aborted", 3)
+    assert len(table(tmp_path / "out").splitlines()) == 4
+
+
 def test_a_scheduler_that_is_gone_leaves_the_table(tmp_path: Path) -> None:
     def gone(task: Task) -> None:
         if len(executor.given) > 5:
