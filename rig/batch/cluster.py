@@ -225,7 +225,10 @@ class Jobs:
                 over.append(job)
         for job in over:
             del self._queue.worker_spec[job], self._worked_s[job]
+        there = set(self._queue.worker_spec)
         if over:
+            self._queue.scale(jobs=len(there))
+        elif len(there) < self._number and there >= set(self._queue.workers):  # a new job may have the old one's name
             self._queue.scale(jobs=self._number)
 
 

@@ -241,8 +241,8 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
     asked: list[int] = []
     workers = {"tcp://1": {"name": "S-1-0"}, "tcp://2": {"name": "S-1-1"}, "tcp://3": {"name": "S-10"}}
     queue = SimpleNamespace(
-        worker_spec={"S-1": {}, "S-10": {}, "S-2": {}}, scheduler_info={"workers": workers},
-        scale=lambda jobs: asked.append(jobs),
+        worker_spec={"S-1": {}, "S-10": {}, "S-2": {}}, workers={"S-1": None, "S-10": None, "S-2": None},
+        scheduler_info={"workers": workers}, scale=lambda jobs: asked.append(jobs),
     )  # fmt: skip
     now_s = [100.0]
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
@@ -258,7 +258,10 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
     now_s[0] += 2
     jobs.renew()
     jobs.renew()
-    assert (asked, list(queue.worker_spec)) == ([3], ["S-10", "S-2"])
+    assert (asked, list(queue.worker_spec)) == ([2], ["S-10", "S-2"]), "first the old one must be gone"
+    del queue.workers["S-1"]
+    jobs.renew()
+    assert asked == [2, 3]
 
 
 def test_a_task_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:
