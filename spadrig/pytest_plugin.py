@@ -13,10 +13,11 @@ import pytest
 
 if TYPE_CHECKING:
     from spadrig.conformance.cases import SpadCase, Taken
+    from spadrig.conformance.strategy import StrategyBench
 
 pytest.register_assert_rewrite(
-    *(f"spadrig.conformance.{part}" for part in ("beam_scanner", "estimator", "line_laser", "spad_array")),
-    "spadrig.conformance.cases",
+    *(f"spadrig.conformance.{part}" for part in ("beam_scanner", "cases", "estimator", "line_laser", "spad_array")),
+    "spadrig.conformance.strategy",
     "spadrig.conformance.sync_source",
 )
 
@@ -53,6 +54,20 @@ def open_spad() -> Any:
 def create_estimator() -> None:
     """A function for `EstimatorSuite` that takes a number of threads and returns a fresh estimator."""
     _wanted("create_estimator", "returns a function from a number of threads to a fresh estimator")
+
+
+@pytest.fixture
+def strategy() -> None:
+    """A strategy for `StrategySuite`."""
+    _wanted("strategy", "returns an object with the members of rig.strategies.strategy.Strategy")
+
+
+@pytest.fixture(scope="class")
+def strategy_bench(tmp_path_factory: pytest.TempPathFactory) -> "StrategyBench":
+    """The small scene of `StrategySuite`, for all tests of a class."""
+    from spadrig.conformance.strategy import StrategyBench
+
+    return StrategyBench(tmp_path_factory.mktemp("bench"))
 
 
 @pytest.fixture

@@ -93,7 +93,7 @@ def test_the_plugin_passes_the_suites_that_we_ship_and_scans_by_its_names(plugge
     shutil.rmtree(tmp_path / "plugin" / "foglab")  # so that the installed one is tested
     ended = run_pytest(plugged, tmp_path / "plugin", "tests")
     assert ended.returncode == 0, ended.stdout
-    assert "16 passed" in ended.stdout
+    assert "22 passed" in ended.stdout
     names = "from rig.config.estimators import estimator_names; from drivers.registry import kinds;"
     shown = subprocess.run(
         [plugged, "-c", f"{names} print(estimator_names()[-1], 'foglab-filtered' in kinds('laser'))"],

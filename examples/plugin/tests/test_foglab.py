@@ -1,4 +1,4 @@
-"""The conformance suites of spadrig on laser and estimator of this package, a scan with both, and a comparison."""
+"""The conformance suites of spadrig on what this package adds, a scan with it, and a comparison."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from foglab.centroid import Centroid
 from foglab.filtered_laser import FilteredLaser
+from foglab.ratio import RATIO, Ratio
 
 from drivers.clock import VirtualClock
 from rig.api import compare_strategies, scan
-from spadrig.conformance import EstimatorSuite, LaserCase, LineLaserSuite
+from spadrig.conformance import EstimatorSuite, LaserCase, LineLaserSuite, StrategySuite
 
 RIG = Path(__file__).parents[1] / "rig.yaml"
 
@@ -31,6 +32,14 @@ class TestCentroid(EstimatorSuite):
     @pytest.fixture
     def create_estimator(self) -> type[Centroid]:
         return Centroid
+
+
+class TestRatio(StrategySuite):
+    """All that a strategy must do."""
+
+    @pytest.fixture
+    def strategy(self) -> Ratio:
+        return RATIO
 
 
 def test_a_scan_uses_both_by_their_names() -> None:

@@ -70,16 +70,16 @@ class ComparisonPlan:
     lux: float | None
     seeds: range
 
-    def parts(self) -> list["Part"]:
+    def parts(self) -> list["ComparisonPart"]:
         """The parts that are measured independently, in the table's order."""
         return [
-            Part(name, scene, air, rule, time_s, self.rows, self.lux, self.seeds)
+            ComparisonPart(name, scene, air, rule, time_s, self.rows, self.lux, self.seeds)
             for (name, scene), air, rule, time_s in product(self.scenes.items(), self.airs, self.rules, self.times_s)
         ]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class ComparisonPart:
     """A part of a comparison: all strategies in one scene and air, by one rule and in one time.
 
     name: of the scene in the table. The other fields are as in `ComparisonPlan`.
@@ -206,7 +206,7 @@ def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan)
 
 def measure_once(config: Mapping[str, Any], ways: Sequence[str], one: Mapping[str, Any]) -> dict[str, Any]:
     """The rows of a part of a comparison as a case: plain values, with the computing times apart."""
-    made = Part(**{**one, "seeds": range(*one["seeds"])})
+    made = ComparisonPart(**{**one, "seeds": range(*one["seeds"])})
     rows = list(_rows(RigConfig.model_validate(config), [find_strategy(name) for name in ways], made))
     return {
         "rows": [{key: value for key, value in asdict(row).items() if key != "compute_s"} for row in rows],
@@ -234,7 +234,7 @@ def _comparison(
     return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], one: Part) -> Iterator[StrategyRow]:
+def _rows(config: RigConfig, ways: Sequence[Strategy], one: ComparisonPart) -> Iterator[StrategyRow]:
     """The rows of a part of a comparison."""
     with part(one.name if one.air is None else f"{one.name}, {one.air}"), TemporaryDirectory() as made:
         tell_stage("making the scene")
@@ -243,7 +243,9 @@ def _rows(config: RigConfig, ways: Sequence[Strategy], one: Part) -> Iterator[St
         yield from _in_scene(configure(config, scene=str(file)), model, ways, one)
 
 
-def _in_scene(config: RigConfig, model: RigModel, ways: Sequence[Strategy], one: Part) -> Iterator[StrategyRow]:
+def _in_scene(
+    config: RigConfig, model: RigModel, ways: Sequence[Strategy], one: ComparisonPart
+) -> Iterator[StrategyRow]:
     """The rows of a part of a comparison, whose scene and air are those of the config."""
     rule, time_s, scan = one.rule, one.time_s, config.scan
     columns = scan.columns // LINES * LINES
