@@ -10,6 +10,7 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
@@ -234,13 +235,18 @@ class Run:
 
 def versions() -> dict[str, str]:
     """Versions of the program and of the packages on which its results depend."""
-    found = {"python": platform.python_version()}
-    for name in ("spadrig", "numpy", "numba", "opencv-contrib-python-headless"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # installed under another name, as distributions repackage it
-            continue
-    return found
+    names = ("spadrig", "numpy", "numba", "opencv-contrib-python-headless")
+    found = {name: text for name in names if (text := _version_of(name)) is not None}
+    return {"python": platform.python_version(), **found}
+
+
+@cache
+def _version_of(package: str) -> str | None:
+    """The version of an installed package. None if it has another name here, as distributions repackage some."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:

@@ -89,8 +89,10 @@ def assert_same(found: StripeTable, wanted: StripeTable) -> None:
         np.testing.assert_array_equal(found.arrays()[name], values, err_msg=name)
 
 
+@cache
 def street(rows: int) -> Scene:
-    """Rows of the yardstick's procedural scene where it is richest: board, pole, ball, back wall and a little floor."""
+    """Rows of the yardstick's procedural scene where it is richest: board, pole, ball, back wall and a little floor;
+    tests must not write into it."""
     scene, part = procedural_scene(), slice(232, 232 + rows)
     return Scene(scene.name, *(np.ascontiguousarray(a[part]) for a in (scene.depth_m, scene.albedo, scene.trusted)))
 

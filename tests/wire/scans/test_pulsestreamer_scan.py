@@ -21,6 +21,8 @@ from tests.system.small_rig import emulated, write_rig
 from tests.wire.emulated_lasers import eventually
 from tests.wire.scans.scan_rig import light
 
+pytestmark = pytest.mark.slow
+
 BLOWS = ("unplugged", "hung", "restarted", "used by another", "scanner unplugged")
 MAPS = 20_000
 """They take several minutes."""

@@ -237,6 +237,14 @@ def test_a_recording_is_compared_with_the_devices_and_the_date_it_was_taken_with
     assert accepted.summary.accepted_calibration[0].startswith("other-spad: ")
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recorded run of the small rig, whose calibration does not state its rig; it stays as it is."""
+    folder = tmp_path_factory.mktemp("recorded")
+    api.scan(write_rig(folder, small()), record=True, out=folder / "run")
+    return folder / "run"
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -249,15 +257,14 @@ def test_a_recording_is_compared_with_the_devices_and_the_date_it_was_taken_with
     ids=str,
 )
 def test_a_recording_s_depths_by_a_calibration_that_does_not_state_its_rig_are_compared(
-    tmp_path: Path, change: dict[str, float], says: str
+    recorded: Path, tmp_path: Path, change: dict[str, float], says: str
 ) -> None:
-    api.scan(write_rig(tmp_path, small()), record=True, out=tmp_path / "run")
     wrong = tmp_path / "wrong.yaml"
     write_yaml(wrong, changed(calibration(), **change))
     for call in (api.reconstruct, api.replay):
         with pytest.raises(UsageError, match=f"its depths are {says} times those of the calibration with "):
-            call(tmp_path / "run", calibration=wrong, out=tmp_path / "depth")
-    result = api.reconstruct(tmp_path / "run", calibration=wrong, accept_calibration=True, out=tmp_path / "depth")
+            call(recorded, calibration=wrong, out=tmp_path / "depth")
+    result = api.reconstruct(recorded, calibration=wrong, accept_calibration=True, out=tmp_path / "depth")
     assert [line.split(":")[0] for line in result.summary.as_json()["accepted_calibration"]] == ["other-depth"]
 
 

@@ -40,21 +40,21 @@ WORKERS = RowWorkers(1)
 HALO = np.tile(np.array([0.0, 1.0, 0.0, 1.5, 0.0], np.float32), (HALO_NODES, 1))
 
 
-def flux_of(label, model, geometry, row, y, c, light):
-    """Flux of each pixel of a row's buffers for a stripe at a label, written out."""
-    length, _, _, start = row
-    side, state = 1 if geometry.near_is_left else -1, state_of(model)
-    buffers = row_buffers(geometry.window, 1)
-    row_fluxes(sweep_of(geometry), state, buffers, y, c)
-    t = side * (label_grid(geometry).x_far[y, c] - start) - label / PER_PX
-    pixels = np.arange(length)
-    at = int(np.floor(t + 0.5))
-    lit = np.clip(t + 0.5 - pixels, 0.0, 1.0)
-    s = light * buffers.scale[at]
-    base = buffers.behind[:length] + lit * (buffers.before[:length] - buffers.behind[:length])
-    halo = halo_shares(model, geometry.width)[buffers.cell[at]]
-    around = np.interp(np.abs(pixels - t), np.arange(geometry.width), halo)
-    return base + s * (pixel_shares(model.line_sigma_px, pixels - t) + around)
+def flux_at(model, geometry, y, c):
+    """What the flux of each pixel of a row's buffers is for a stripe at a label and of some light, written out."""
+    side, buffers = 1 if geometry.near_is_left else -1, row_buffers(geometry.window, 1)
+    length, _, _, start = row_fluxes(sweep_of(geometry), state_of(model), buffers, y, c)
+    pixels, shares, x_far = np.arange(length), halo_shares(model, geometry.width), label_grid(geometry).x_far[y, c]
+
+    def flux(label, light):
+        t = side * (x_far - start) - label / PER_PX
+        at = int(np.floor(t + 0.5))
+        lit = np.clip(t + 0.5 - pixels, 0.0, 1.0)
+        base = buffers.behind[:length] + lit * (buffers.before[:length] - buffers.behind[:length])
+        around = np.interp(np.abs(pixels - t), np.arange(geometry.width), shares[buffers.cell[at]])
+        return base + light * buffers.scale[at] * (pixel_shares(model.line_sigma_px, pixels - t) + around)
+
+    return flux, start + side * pixels
 
 
 @pytest.mark.parametrize("apart", [1, 4])
@@ -70,16 +70,15 @@ def test_costs_are_those_of_a_stripe_with_its_halo(apart, monkeypatch):
     costs.fill(volume, 0, geometry.rows, pointers(room), out)
     off = []
     for c in range(4, 44, 5):
-        row = row_fluxes(sweep_of(geometry), state_of(model), row_buffers(geometry.window, 1), y, c)
-        side = 1 if geometry.near_is_left else -1
-        n = volume.counts[c, y, row[3] + side * np.arange(row[0]) - geometry.x0[c]].astype(float)
+        flux, x = flux_at(model, geometry, y, c)
+        n = volume.counts[c, y, x - geometry.x0[c]].astype(float)
         given = out[y, c, : costs.grid.stripes].astype(float)
         labels = np.flatnonzero(given != EXCLUDED)
         labels = labels[(labels > 4) & (labels < labels[-1] - 4)]
         scores = np.full((len(labels), len(_lights(model))), -np.inf)
         for i, label in enumerate(labels):
             for m, light in enumerate(_lights(model).astype(float)):
-                p = (1 - FLOOR) * -np.expm1(-flux_of(label, model, geometry, row, y, c, light)) + FLOOR / 2
+                p = (1 - FLOOR) * -np.expm1(-flux(label, light)) + FLOOR / 2
                 scores[i, m] = (n * np.log(p) + (10 - n) * np.log1p(-p)).sum()
         nats = given[labels] / costs.units_per_nat
         wanted = scores.max(axis=1).max() - scores.max(axis=1)
