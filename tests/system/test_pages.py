@@ -10,6 +10,7 @@ import shlex
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,8 @@ NOT_RUN: Mapping[str, str] = {
     r"rig .*(\.\.\.|\b[A-Z][A-Z-]*\b)": "leaves a value open",
 }
 """Commands that are not run, by a pattern of their beginning, and why. All are parsed (tests/unit/test_docs.py)."""
+NOTEBOOK_COLUMNS = 250
+"""Columns of the small rig of notebooks, one of which draws column 200."""
 PYTHON = {"own-sensor.md"}
 """Pages whose Python is run here, block after block; other tests run that of one-device.md and python.md."""
 COMMAND = re.compile(r"(?:then: )?(rig(?: .*?)?)(?: > (\S+))?")
@@ -86,19 +89,28 @@ def write(path: Path, content: object) -> None:
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
 
 
-@pytest.fixture
-def typed(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[
-    [str, str | None], int
-]:  # fmt: skip
-    """Type a command in a folder with what pages take for granted, and with a small rig as the bundled one."""
-    bundled = Path(shutil.copytree(BUNDLED, tmp_path / "config"))
+def small_rig(columns: int = 100) -> dict[str, Any]:
+    """The config of a small rig under the name of the bundled one."""
     small = config() | {"name": "simulated", "calibration": "tiny.yaml", "estimate": {"estimator": "auto"}}
     small["world"] |= {"geometry": "./tiny.yaml", "scene": "street"}
-    small["scan"] |= {"columns": 100}
-    write(bundled / "tiny.yaml", calibration())
-    write(bundled / "simulated.yaml", small)
-    monkeypatch.setattr("rig.config.files.BUNDLED", bundled)
+    small["scan"] |= {"columns": columns}
+    return small
 
+
+@pytest.fixture
+def bundled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of bundled configs, of which the simulated rig is a small one."""
+    folder = Path(shutil.copytree(BUNDLED, tmp_path / "config"))
+    write(folder / "tiny.yaml", calibration())
+    write(folder / "simulated.yaml", small_rig())
+    monkeypatch.setattr("rig.config.files.BUNDLED", folder)
+    return folder
+
+
+@pytest.fixture
+def typed(rig: Rig, bundled: Path) -> Callable[[str, str | None], int]:
+    """Type a command in a folder with what pages take for granted, and with a small rig as the bundled one."""
+    small = small_rig()
     here = Path.cwd()
     write(here / "tiny.yaml", calibration())
     tangents = np.linspace(-0.3, 0.5, 20)
@@ -166,7 +178,9 @@ def test_python_and_yaml_of_a_page_are_what_the_program_takes(page: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[notebook.stem for notebook in NOTEBOOKS])
-def test_a_notebook_runs_and_lies_there_without_outputs(notebook: Path) -> None:
+def test_a_notebook_runs_and_lies_there_without_outputs(notebook: Path, bundled: Path) -> None:
+    """With a small rig in place of the simulated one, which `make docs` runs them with."""
+    write(bundled / "simulated.yaml", small_rig(NOTEBOOK_COLUMNS))
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
     place: dict[str, object] = {}
     for cell in cells:
