@@ -75,7 +75,8 @@ def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], Wr
         done = tabulate(ways, found, "aborted" if aborted else "complete")
         return write_files(folder, done) if done.rows else None
 
-    return cases_of(loaded, ways, asked), write
+    texts = {parse_quantity(text, "time"): text for text in _once(request.times) or TIMES}
+    return cases_of(loaded, ways, asked, texts), write
 
 
 def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, list[Strategy], ComparisonPlan]:

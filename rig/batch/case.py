@@ -124,6 +124,26 @@ def checksum(path: str) -> str:
         raise UsageError(f"cannot read {path}: {error.strerror or error}; correct the path") from error
 
 
+_known: dict[str, tuple[list[tuple[str, int, int]], str]] = {}
+"""Checksums that were computed, with names, sizes and times of the files then."""
+
+
+def changed_file(files: Mapping[str, str]) -> str | None:
+    """The first path whose content has not the given checksum; None if all have. Unchanged files are not read again."""
+    for path, wanted in files.items():
+        try:
+            top = Path(path)
+            stats = [(str(each), each.stat()) for each in [top, *sorted(top.rglob("*"))]]
+            stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+            if _known.get(path, ([], ""))[0] != stamp:
+                _known[path] = stamp, checksum(path)
+        except (OSError, UsageError):
+            return path
+        if _known[path][1] != wanted:
+            return path
+    return None
+
+
 def files_of(config: Mapping[str, Any], scene: str | None = None) -> tuple[str, ...]:
     """Paths of the files and folders that decide what a config means: calibration, learned state, scene and surfaces.
 

@@ -42,6 +42,8 @@ ANSWER_S: Final = 10.0
 """Seconds in which a scheduler answers at first."""
 LOOK_S: Final = 1.0
 """Seconds from one count of the workers to the next."""
+TAKEN_S: Final = 120.0
+"""Seconds in which a batch system takes the first jobs."""
 JOB_OVER_S: Final = 30.0
 """Seconds without any of its workers after which a job counts as over: one that has crashed starts again sooner."""
 MOST_NAMED: Final = 5
@@ -166,7 +168,7 @@ class Cluster:
 
     def _judged(self, ended: Ended) -> Ended:
         """A task that came back undone from a worker that cannot do any is to be begun again elsewhere."""
-        if ended.status not in ("other code", "no folder"):
+        if ended.status not in ("other code", "other files", "no folder"):
             return ended
         note = f"worker {ended.worker} was retired: {ended.message}"
         address = ended.worker.partition(" ")[0]
@@ -211,11 +213,16 @@ class Jobs:
 
     def __init__(self, queue: Any, number: int) -> None:
         self._queue, self._number = queue, number
+        self._begun_s = time.monotonic()
+        self._taken = False
         self._worked_s: dict[str, float] = {}
 
     def renew(self) -> None:
-        """Ask for other jobs in the place of those that are over."""
+        """Ask for other jobs in the place of those that are over. Raises RigError if the system takes none at all."""
         now_s = time.monotonic()
+        self._taken |= bool(self._queue.workers)
+        if not self._taken and now_s - self._begun_s > TAKEN_S:
+            raise RigError("the batch system takes no job; its reason is above. Correct the file, then run this again")
         workers = [str(each["name"]) for each in list(self._queue.scheduler_info["workers"].values())]
         over = []
         for job in list(self._queue.worker_spec):

@@ -5,6 +5,7 @@ is written with all results that there are.
 """
 
 import contextlib
+import logging
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,6 +25,9 @@ RETRIES: Final = 2
 LOST: Final = 20
 """Times that a case is begun again if the connection to its worker broke, which is not the fault of the case."""
 SAID_S: Final = 0.5
+PATIENT_S: Final = 10.0
+"""Seconds without any case done after which the reason is told."""
+_log = logging.getLogger(__name__)
 
 
 class Executor(Protocol):
@@ -127,9 +131,13 @@ def run_batch(
             executor.close()
         except KeyboardInterrupt:  # a second one, as `timeout` sends it and impatient people do
             aborted = True
+        except Exception as error:  # the table is written all the same
+            _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
+        # Alone first: what a shard has done that was not alone any more is in the list then.
+        alone = store.alone() if shard[1] > 1 else True
         total, only = len(store.cases), shard[1] == 1
         there = set() if only else store.finished()
-        packed = only or (len(there) == total and store.alone())
+        packed = only or (alone and len(there) == total)
         if packed:
             try:
                 there = store.pack()
@@ -222,6 +230,7 @@ class _Runs:
             self.stopped = {
                 "cannot write": f"{ended.message}; make room, then run it again",
                 "other code": "the code has been changed since the batch began; name a new folder",
+                "other files": f"{ended.message}; name a new folder, or put it back",
                 "no folder": ended.message,
             }.get(ended.status, self.stopped)
 
@@ -249,12 +258,13 @@ class _Told:
             notes.append(f"{in_words(left_s)} left")
         if runs.failed:
             notes.append(f"{len(runs.failed)} failed")
-        if not ended and runs.under_way:
-            notes.append("the first cases load compiled code, which takes minutes where it is new")
         if not executor.workers:
             notes.append("waiting for workers")
+        elif not ended and runs.under_way and now_s - self._begun_s > PATIENT_S:
+            notes.append("the first cases load compiled code, which takes minutes where it is new")
         # The stage changes with each tenth, since of each stage a line goes to where there is no terminal.
-        tell_stage(f"cases, {10 * (10 * done // max(1, self._total))} %", done, self._total, "done", ", ".join(notes))
+        stage = f"cases, {10 * (10 * done // max(1, self._total))} %" if executor.workers else "no workers"
+        tell_stage(stage, done, self._total, "done", ", ".join(notes))
         if self._progress is not None:
             self._progress(done, self._total)
 

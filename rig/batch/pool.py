@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
@@ -44,11 +45,19 @@ class Limits:
 
 
 def memory_bytes() -> int:
-    """This computer's memory, or the part of it that our control group may use."""
+    """This computer's memory, or the part of it that our control group, such as a job's, and those above it may use."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
-    for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+    top, files = Path("/sys/fs/cgroup"), []
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
+            _, kinds, group = line.split(":", 2)  # version 2 has no kinds
+            place, name = (top, "memory.max") if not kinds else (top / "memory", "memory.limit_in_bytes")
+            if not kinds or "memory" in kinds.split(","):
+                own = Path(group.lstrip("/"))
+                files += [place / each / name for each in (own, *own.parents)]
+    for file in files:
         with contextlib.suppress(OSError, ValueError):
-            total = min(total, int(Path(file).read_text()))
+            total = min(total, int(file.read_text()))
     return total
 
 
@@ -66,7 +75,7 @@ class Pool:
         self.workers = usual_workers(limits) if workers is None else workers
         share = int((1 - KEPT_FREE) * memory_bytes() / self.workers)
         self._limits = Limits(limits.time_s, limits.memory_bytes or share)
-        self._replaced = 0
+        self._replaced: Counter[str] = Counter()
         self._idle = [f"{name} {number}" for number in range(self.workers, 0, -1)]
         self._free: list[_Process] = []
         self._busy: list[_Process] = []
@@ -79,8 +88,9 @@ class Pool:
     @property
     def notes(self) -> list[str]:
         """A sentence on processes that had to be replaced, if there were any."""
-        what = "a process" if self._replaced == 1 else f"{self._replaced} processes"
-        return [f"{what} died, hung or took too much memory, replaced by another"] if self._replaced else []
+        how = {"died": "died", "hung": "hung", "memory": "took too much memory"}
+        said = [f"{number} {how[kind]}" for kind, number in sorted(self._replaced.items())]
+        return [f"processes that were replaced: {', '.join(said)}"] if said else []
 
     def submit(self, task: Task) -> None:
         """Begin a task; only if there is room."""
@@ -104,7 +114,7 @@ class Pool:
             if process.alive:
                 self._free.append(process)
             else:
-                self._replaced += 1
+                self._replaced[end.status] += 1
                 self._idle.append(process.name)
         return ended
 

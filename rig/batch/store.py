@@ -153,15 +153,20 @@ class Store:
             what = "with another version of the code"
         else:
             there = {each[CASE] for each in map(json.loads, listed.splitlines())}
-            what = f"with other cases: {len(there)}, of which {len(there & self.cases.keys())} are the same"
+            same = len(there & self.cases.keys())
+            if same == len(there) < len(self.cases):
+                raise UsageError(
+                    f"{self.folder} was begun with {same} of these {len(self.cases)} cases, and a study stays as it "
+                    "was begun; name another folder for all of them"
+                )
+            what = f"with other cases: {len(there)}, of which {same} are the same"
         raise UsageError(f"{self.folder} was begun {what}; name another folder for what you ask now")
 
     def task(self, name: str) -> Task:
         """A case as it is sent to a worker."""
         case = self.cases[name]
-        return Task(
-            name, case.function, case.inputs, self.codes[package_of(case.function)], str(self.folder), case.keeps
-        )
+        code, files = self.codes[package_of(case.function)], {path: self.checksums[path] for path in case.files}
+        return Task(name, case.function, case.inputs, code, str(self.folder), case.keeps, files)
 
     def finished(self) -> set[str]:
         """Names of the cases that have a result. Files that a loss of power has torn are removed."""
@@ -195,11 +200,15 @@ class Store:
         return packed
 
     def alone(self) -> bool:
-        """Whether no other shard is at work in the folder; none can begin then until `close`."""
+        """Whether no other shard is at work in the folder; none can begin then until `close`. If there is one, it will
+        be the one that is alone. True where the file system has no locks: the table may then be written twice.
+        """
         try:
-            hold(self._lock)
-        except OSError:
+            hold(self._lock)  # gives up the shared lock, also if it fails
+        except BlockingIOError:
             return False
+        except OSError:
+            return True
         return True
 
 

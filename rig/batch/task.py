@@ -12,11 +12,11 @@ import shutil
 import time
 import traceback
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from rig.batch.case import MEASURED, call, code_digest, package_of
+from rig.batch.case import MEASURED, call, changed_file, code_digest, package_of
 from rig.run_folder.plain_json import json_line
 
 CASES: Final = "cases"
@@ -27,9 +27,12 @@ HEAD: Final = "study.json"
 CASE: Final = "case"
 RESULT: Final = "result"
 
-Status = Literal["done", "raised", "died", "hung", "memory", "cannot write", "other code", "no folder", "lost"]
-"""The end of a case. died: its process ended; hung: it took too long; memory: it took too much; other code, no folder:
-the worker has another version of the code, or does not see the folder; lost: the connection to the worker broke."""
+Status = Literal[
+    "done", "raised", "died", "hung", "memory", "cannot write", "other code", "other files", "no folder", "lost"
+]
+"""The end of a case. died: its process ended; hung: it took too long; memory: it took too much; other code, other
+files, no folder: the worker has another version of the code or of what the case reads, or does not see the folder;
+lost: the connection to the worker broke."""
 
 _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 
@@ -37,7 +40,7 @@ _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 @dataclass(frozen=True, slots=True)
 class Task:
     """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. keeps: whether the
-    case writes files of its own."""
+    case writes files of its own. files: checksums of what it reads, by path."""
 
     name: str
     function: str
@@ -45,6 +48,7 @@ class Task:
     code: str
     folder: str
     keeps: bool = False
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def as_line(self) -> str:
         """The task as a line of JSON."""
@@ -70,6 +74,9 @@ def perform(task: Task, worker: str = "") -> Ended:
         return Ended(task.name, "no folder", f"{folder} is not there; share it under the same path", worker=worker)
     if code_digest(package_of(task.function)) != task.code:
         return Ended(task.name, "other code", "another version of the code is installed", worker=worker)
+    if (changed := changed_file(task.files)) is not None:
+        said = f"{changed} is not there any more as it was when the batch began"
+        return Ended(task.name, "other files", said, worker=worker)
     file = result_file(folder, task.name)
     if file.exists():
         return Ended(task.name, "done", worker=worker)

@@ -115,10 +115,8 @@ def _show_batch(done: "BatchResult") -> None:
         say(f"{failure}; to do it alone{limit.get(failure.kind, '')}: {failure.command}")
     if len(batch.failures) > MOST_FAILURES:
         say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / 'failures.jsonl'}")
-    tell(
-        f"{batch.verdict}: {batch.done} of {batch.total} cases done, {batch.run} of them now, in "
-        f"{in_words(batch.wall_s)} with up to {batch.workers} at once"
-    )
+    now = f", in {in_words(batch.wall_s)} with up to {batch.workers} at once" if batch.run else ""
+    tell(f"{batch.verdict}: {batch.done} of {batch.total} cases done, {batch.run} of them now{now}")
     if batch.reason:
         say(batch.reason)
     if batch.verdict == "aborted":

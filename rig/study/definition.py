@@ -28,7 +28,14 @@ KEYS: Final[Mapping[Action, tuple[str, ...]]] = {
 """Settings of each action. Those that simulate a rig take keys of its config too: `scan.columns`."""
 WHOLE: Final[tuple[Action, ...]] = ("tradeoff", "strategies")
 """Actions whose lists are all combined in one table of their own."""
+OF_A_CASE: Final[Mapping[Action, tuple[str, ...]]] = {
+    "tradeoff": ("scene", "fog", "exposures", "lines"),
+    "strategies": ("scene", "fog", "time", "rule"),
+}
+"""Settings of such an action that tell its cases apart. Each case has all of the others, such as all estimators."""
 PATHS: Final = "config", "scene", "recording", "plan", "calibration"
+NAMES: Final = "config", "scene"
+"""Those that may also be names of what is built in."""
 SIZES: Final = {"MB": 1e6, "GB": 1e9}
 TIMES_S: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _AMOUNT: Final = re.compile(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", re.ASCII)
@@ -114,12 +121,25 @@ class Study(BaseModel):
         ]
         if self.do in WHOLE and self.also:
             problems.append(f"also is not for {self.do}, which combines all lists; add its values to vary")
+        problems += self._problems_of_omit()
         size = len(self.seeds) * len(self.also)
         combined = len(self.seeds)
         for values in self.vary.values():
             combined *= len(values)
         if size + combined > MOST_CASES:
             problems.append(f"{size + combined} cases are too many, at most {MOST_CASES}; make several studies of it")
+        return problems
+
+    def _problems_of_omit(self) -> list[str]:
+        """A line for each setting or value of `omit` that no case has, so that nothing would be left out."""
+        problems = []
+        apart = OF_A_CASE.get(self.do, KEYS[self.do])
+        for key, value in (item for one in self.omit for item in one.items()):
+            values = [*self.vary.get(key, []), *(one[key] for one in [self.set, *self.also] if key in one)]
+            if key in KEYS[self.do] and key not in apart:
+                problems.append(f"omit has {key!r}, but every case of {self.do} has all of them; make two studies")
+            elif values and value not in values:
+                problems.append(f"omit has {key} {value!r}, which no case has; {key} is one of {values}")
         return problems
 
     @property
@@ -143,7 +163,7 @@ def left_out(setting: Mapping[str, Any], omit: Sequence[Mapping[str, Any]]) -> b
 def load_study(study: Study | PathLike | Mapping[str, Any]) -> Study:
     """A study, from its file or its content. Raises UsageError with one line per problem.
 
-    Paths in a file are relative to its folder; where there is no such file, they stay as they are, for names.
+    Paths in a file are relative to its folder. A config or scene may be a name instead.
     """
     if isinstance(study, Study):
         return study
@@ -181,7 +201,8 @@ def _anchored(key: str, value: Any, folder: Path) -> Any:
     if key not in PATHS or not isinstance(value, str):
         return value
     path = folder / os.path.expanduser(value)
-    return str(path) if os.path.exists(path) else value
+    name = key in NAMES and Path(value).name == value and not value.endswith((".yaml", ".yml"))
+    return value if name and not os.path.exists(path) else str(path)
 
 
 def _in_a_line(where: str, error: Mapping[str, Any]) -> str:

@@ -18,6 +18,7 @@ from rig.batch.case import Case, Result
 from rig.batch.engine import Batch, Executor, probe, run_batch
 from rig.batch.pool import Limits, Pool, usual_workers
 from rig.batch.store import Row, Store, read_failures, read_rows
+from rig.batch.task import HEAD
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
 from rig.progress import Progress
@@ -123,7 +124,7 @@ def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes:
         scratch = stack.enter_context(Store(place / "probe", made.cases))
         total = len(scratch.cases)
         left = total
-        if request.out is not None and Path(request.out).exists():
+        if request.out is not None and (Path(request.out) / HEAD).exists():
             store = stack.enter_context(Store(Path(request.out), made.cases, {"study": loaded.model_dump(mode="json")}))
             left -= len(store.finished())
         tried_s = probe(scratch, Pool(1, limits)) if left else [0.0]

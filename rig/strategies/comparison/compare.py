@@ -29,7 +29,7 @@ from rig.progress import part, tell_stage
 from rig.simd import Float32, Float64
 from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule, Spent
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
-from rig.strategies.comparison.places import rig_model, scene_file, visibility_m
+from rig.strategies.comparison.places import OWN, rig_model, scene_file, visibility_m
 from rig.strategies.comparison.score import Score, score, scored_pixels
 from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort, find_strategy
 from rig.tradeoff.effects import open_world
@@ -191,14 +191,17 @@ def run_comparison(
     return _comparison(ways, rows, verdict)
 
 
-def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
-    """A case for each part, with all strategies."""
+def cases_of(
+    config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan, texts: Mapping[float, str]
+) -> list[Case]:
+    """A case for each part, with all strategies. texts: the times as they were written, by their seconds."""
     content, names = portable_content(config), [way.name for way in ways]
     cases = []
     for one in asked.parts():
         file = str(Path(one.scene).absolute()) if Path(one.scene).exists() else one.scene
         plain = {**asdict(one), "scene": file, "seeds": [one.seeds.start, one.seeds.stop]}
-        labels = {"scene": one.scene, "air": one.air, "rule": one.rule, "time_ms": 1e3 * one.time_s}
+        fog = OWN if one.air is None else one.air
+        labels = {"scene": one.scene, "fog": fog, "rule": one.rule, "time": texts[one.time_s]}
         inputs = {"config": content, "ways": names, "one": plain}
         cases.append(Case(f"{__name__}:measure_once", inputs, labels, files_of(content, file)))
     return cases

@@ -102,6 +102,11 @@ def test_a_study_of_strategies_has_the_rows_of_the_comparison(tmp_path: Path) ->
     expected = json.loads(json.dumps(one.as_json(), default=str))
     assert without(("compute_s",), found["rows"]) == without(("compute_s",), expected["rows"])
     assert {key for key in expected if found[key] != expected[key]} <= {"rows", "seconds"}
+    assert [row.labels for row in done.rows()] == [
+        {"scene": "ramp", "fog": fog, "rule": "energy", "time": "20ms"} for fog in ("clear", "20m")
+    ]
+    planned = api.plan_batch({**study, "omit": [{"fog": "20m", "time": "20ms"}]}, out=tmp_path / "none")
+    assert planned.cases == 1
 
 
 @pytest.mark.usefixtures("here")
@@ -161,6 +166,9 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     assert "cases: 1, to be done: 1" in planned.out
     assert "since cases that were tried took " in planned.out
     assert not Path("study").exists()
+    Path("study").mkdir()
+    assert rig("batch", "study.yaml", "--out", "study", "--dry-run").code == 0
+    assert list(Path("study").iterdir()) == [], "a trial begins nothing"
     ran = rig("batch", "study.yaml", "--out", "study", "--json")
     assert ran.code == 0, ran.err
     said = json.loads(ran.out)

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.recorded.contents import INDEX_FILE
 from rig.batch import case as module
-from rig.batch.case import Case, call, checksum, code_digest, package_of
+from rig.batch.case import Case, call, changed_file, checksum, code_digest, package_of
 from rig.errors import UsageError
 from tests.unit.rig.batch.executors import TINY
 
@@ -59,6 +59,26 @@ def test_of_a_recording_the_index_is_read_and_frames_are_only_measured(tmp_path:
     assert checksum(str(tmp_path)) == before
     (tmp_path / "frames.bin").write_text("111")
     assert checksum(str(tmp_path)) != before
+
+
+def test_a_changed_file_is_found_and_unchanged_ones_are_not_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    one, other, folder = tmp_path / "one", tmp_path / "folder" / "other", tmp_path / "folder"
+    one.write_text("1")
+    other.write_text("2")
+    files = {str(path): checksum(str(path)) for path in (one, folder)}
+    assert changed_file(files) is None
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "checksum", lambda path: pytest.fail(f"{path} was read again"))
+        assert changed_file(files) is None
+    other.write_text("22")
+    assert changed_file(files) == str(folder)
+    other.write_text("2")
+    assert changed_file(files) is None
+    one.unlink()
+    assert changed_file(files) == str(one)
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:

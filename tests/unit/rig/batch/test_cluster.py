@@ -16,7 +16,7 @@ import pytest
 
 from rig.batch import cluster as module
 from rig.batch.case import Case, checksum
-from rig.batch.cluster import JOB_OVER_S, Cluster, Jobs, connect
+from rig.batch.cluster import JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect
 from rig.batch.engine import Batch, run_batch
 from rig.batch.pool import Limits
 from rig.batch.store import Store
@@ -262,6 +262,19 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
     del queue.workers["S-1"]
     jobs.renew()
     assert asked == [2, 3]
+
+
+def test_a_batch_system_that_takes_no_job_ends_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = SimpleNamespace(worker_spec={"S-1": {}}, workers={}, scheduler_info={"workers": {}}, scale=None)
+    now_s = [100.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    jobs = Jobs(queue, 1)
+    jobs.renew()
+    now_s[0] += TAKEN_S + 1
+    with pytest.raises(RigError, match="the batch system takes no job; its reason is above"):
+        jobs.renew()
+    queue.workers["S-1"] = None
+    jobs.renew()
 
 
 def test_a_task_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:

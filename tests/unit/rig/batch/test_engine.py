@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 
 from rig.batch import engine as module
+from rig.batch.case import Case
 from rig.batch.engine import LOST, Batch, in_words, probe, run_batch
 from rig.batch.store import Store, read_failures
 from rig.batch.task import Ended, Status, Task, result_file
 from rig.errors import RigError, UsageError
 from rig.progress import Step, listening
-from tests.unit.rig.batch.executors import Inline, squares, troubles
+from tests.unit.rig.batch.executors import TINY, Inline, squares, troubles
 
 
 def table(folder: Path) -> bytes:
@@ -52,14 +53,57 @@ def test_shards_give_the_very_table_of_one_run(tmp_path: Path) -> None:
     assert table(tmp_path / "three") == table(tmp_path / "one")
 
 
-def test_of_shards_that_end_at_once_one_writes_the_table(tmp_path: Path) -> None:
-    with Store(tmp_path / "out", squares(4), shared=True) as store:
-        with Store(tmp_path / "out", squares(4), shared=True) as other:
-            run_batch(store, Inline(), shard=(0, 2))
-            early = run_batch(other, Inline(), shard=(1, 2))
-            assert (early.verdict, early.done, early.packed) == ("part", 4, False)
-        late = run_batch(store, Inline(), shard=(0, 2))
-        assert (late.verdict, late.packed) == ("complete", True)
+def test_of_shards_that_end_at_once_one_writes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ends: list[Batch] = []
+    with (
+        Store(tmp_path / "out", squares(4), shared=True) as store,
+        Store(tmp_path / "out", squares(4), shared=True) as other,
+    ):
+        listed = other.finished
+
+        def listed_while_another_ends() -> set[str]:
+            found = listed()
+            if len(found) == 2 and not ends:
+                ends.append(run_batch(store, Inline(), shard=(0, 2)))
+            return found
+
+        monkeypatch.setattr(other, "finished", listed_while_another_ends)
+        ends.append(run_batch(other, Inline(), shard=(1, 2)))
+    assert [(each.verdict, each.packed) for each in ends].count(("complete", True)) == 1, ends
+    assert len(table(tmp_path / "out").splitlines()) == 5
+
+
+def test_workers_that_cannot_be_ended_leave_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise AssertionError("created")
+
+    executor = Inline()
+    monkeypatch.setattr(executor, "close", fail)
+    assert run(tmp_path / "out", executor).verdict == "complete"
+    assert len(table(tmp_path / "out").splitlines()) == 8
+
+
+def test_an_input_that_changes_stops_the_batch(tmp_path: Path) -> None:
+    file = tmp_path / "input"
+    file.write_text("1")
+    cases = [Case(f"{TINY}:square", {"x": x}, {"x": x}, (str(file),)) for x in range(3)]
+
+    done_before: list[str] = []
+
+    def change(task: Task) -> None:
+        if done_before:
+            file.write_text("changed")
+        done_before.append(task.name)
+
+    with Store(tmp_path / "out", cases) as store:
+        done = run_batch(store, Inline(change))
+    assert (done.verdict, done.done) == ("stopped", 1)
+    assert (
+        done.reason == f"{file} is not there any more as it was when the batch began; name a new folder, or put it back"
+    )
+    file.write_text("1")
+    with Store(tmp_path / "out", cases) as store:
+        assert run_batch(store, Inline()).verdict == "complete"
 
 
 @pytest.mark.parametrize("status", ["died", "hung", "memory"])

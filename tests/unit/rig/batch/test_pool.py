@@ -53,7 +53,7 @@ def test_a_case_that_dies_once_is_done_by_another_process(tmp_path: Path) -> Non
     cases = troubles("die", tmp_path / "counts", (1, 2, 3), times=1)
     done = run(tmp_path / "out", cases, Limits(), retries=1)
     assert (done.verdict, done.done) == ("complete", 3)
-    assert done.notes == ("3 processes died, hung or took too much memory, replaced by another",)
+    assert done.notes == ("processes that were replaced: 3 died",)
 
 
 def test_processes_have_one_thread_each_and_are_used_again(tmp_path: Path) -> None:
@@ -136,6 +136,25 @@ def test_memory_is_that_of_the_machine_and_of_a_process() -> None:
     assert 100 << 20 < memory_bytes() < 1 << 50
     assert 1 << 20 < resident_bytes(os.getpid()) < memory_bytes()
     assert resident_bytes(2**30) == 0
+
+
+def test_memory_is_at_most_that_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = {
+        "/proc/self/cgroup": "0::/slurm/job_7/step",
+        "/sys/fs/cgroup/slurm/job_7/step/memory.max": "max",
+        "/sys/fs/cgroup/slurm/job_7/memory.max": f"{3 << 20}",
+    }
+
+    def read(file: Path) -> str:
+        if str(file) not in files:
+            raise FileNotFoundError(file)
+        return files[str(file)]
+
+    monkeypatch.setattr(Path, "read_text", read)
+    assert memory_bytes() == 3 << 20
+    files["/proc/self/cgroup"] = "5:cpu,memory:/job_8\n4:devices:/"
+    files["/sys/fs/cgroup/memory/job_8/memory.limit_in_bytes"] = f"{2 << 20}"
+    assert memory_bytes() == 2 << 20
 
 
 def alive(pid: int) -> bool:

@@ -38,6 +38,14 @@ def problems_of(content: dict[str, Any]) -> list[str]:
         ({"do": "scan", "set": {"poses": 3}}, "study: scan has no setting 'poses'; it has config, scene,"),
         ({"do": "tradeoff", "set": {"scan.columns": 3}}, "study: tradeoff has no setting 'scan.columns'"),
         ({"do": "tradeoff", "also": [{"fog": "20m"}]}, "study: also is not for tradeoff, which combines all lists"),
+        (
+            {"do": "scan", "vary": {"fog": ["20m"]}, "omit": [{"fog": "20 m"}]},
+            "study: omit has fog '20 m', which no case has; fog is one of ['20m']",
+        ),
+        (
+            {"do": "strategies", "omit": [{"strategy": "gray-spad"}]},
+            "study: omit has 'strategy', but every case of strategies has all of them; make two studies",
+        ),
         ({"do": "scan", "repeat": MOST_CASES + 1}, f"{MOST_CASES + 1} cases are too many, at most {MOST_CASES}"),
     ],
 )
@@ -122,6 +130,11 @@ def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path) -> 
     assert study.vary == {"scene": [str(tmp_path / "dust.yaml"), "street"]}
     assert study.also == [{"scene": str(tmp_path / "dust.yaml"), "estimator": "dust.yaml"}]
     assert [each["scene"] for each in study.combinations()] == ["street"], "what is left out is meant the same way"
+    content = {"do": "reconstruct", "set": {"plan": "plan.json"}, "vary": {"recording": ["monday", "/data/tuesday"]}}
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(content))
+    made = load_study(tmp_path / "study.yaml")
+    assert made.vary["recording"] == [str(tmp_path / "monday"), "/data/tuesday"], "also where there is none yet"
+    assert made.set == {"plan": str(tmp_path / "plan.json")}
 
 
 def test_a_study_may_be_its_content_or_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
