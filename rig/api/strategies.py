@@ -76,7 +76,8 @@ def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], Wr
         return write_files(folder, done) if done.rows else None
 
     texts = {parse_quantity(text, "time"): text for text in _once(request.times) or TIMES}
-    return cases_of(loaded, ways, asked, texts), write
+    cases = cases_of(loaded, ways, asked)
+    return [replace(case, labels={**case.labels, "time": texts[case.labels["time"]]}) for case in cases], write
 
 
 def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, list[Strategy], ComparisonPlan]:

@@ -220,7 +220,7 @@ class Jobs:
     def renew(self) -> None:
         """Ask for other jobs in the place of those that are over. Raises RigError if the system takes none at all."""
         now_s = time.monotonic()
-        self._taken |= bool(self._queue.workers)
+        self._taken |= any(job.job_id is not None for job in list(self._queue.workers.values()))
         if not self._taken and now_s - self._begun_s > TAKEN_S:
             raise RigError("the batch system takes no job; its reason is above. Correct the file, then run this again")
         workers = [str(each["name"]) for each in list(self._queue.scheduler_info["workers"].values())]

@@ -191,17 +191,15 @@ def run_comparison(
     return _comparison(ways, rows, verdict)
 
 
-def cases_of(
-    config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan, texts: Mapping[float, str]
-) -> list[Case]:
-    """A case for each part, with all strategies. texts: the times as they were written, by their seconds."""
+def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
+    """A case for each part, with all strategies."""
     content, names = portable_content(config), [way.name for way in ways]
     cases = []
     for one in asked.parts():
         file = str(Path(one.scene).absolute()) if Path(one.scene).exists() else one.scene
         plain = {**asdict(one), "scene": file, "seeds": [one.seeds.start, one.seeds.stop]}
         fog = OWN if one.air is None else one.air
-        labels = {"scene": one.scene, "fog": fog, "rule": one.rule, "time": texts[one.time_s]}
+        labels = {"scene": one.scene, "fog": fog, "rule": one.rule, "time": one.time_s}
         inputs = {"config": content, "ways": names, "one": plain}
         cases.append(Case(f"{__name__}:measure_once", inputs, labels, files_of(content, file)))
     return cases

@@ -240,10 +240,13 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
 def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     workers = {"tcp://1": {"name": "S-1-0"}, "tcp://2": {"name": "S-1-1"}, "tcp://3": {"name": "S-10"}}
+    jobs_there = {name: SimpleNamespace(job_id="7") for name in ("S-1", "S-10", "S-2")}
     queue = SimpleNamespace(
-        worker_spec={"S-1": {}, "S-10": {}, "S-2": {}}, workers={"S-1": None, "S-10": None, "S-2": None},
-        scheduler_info={"workers": workers}, scale=lambda jobs: asked.append(jobs),
-    )  # fmt: skip
+        worker_spec=dict.fromkeys(jobs_there, {}),
+        workers=jobs_there,
+        scheduler_info={"workers": workers},
+        scale=lambda jobs: asked.append(jobs),
+    )
     now_s = [100.0]
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     jobs = Jobs(queue, 3)
@@ -265,7 +268,8 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
 
 
 def test_a_batch_system_that_takes_no_job_ends_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    queue = SimpleNamespace(worker_spec={"S-1": {}}, workers={}, scheduler_info={"workers": {}}, scale=None)
+    job = SimpleNamespace(job_id=None)
+    queue = SimpleNamespace(worker_spec={"S-1": {}}, workers={"S-1": job}, scheduler_info={"workers": {}}, scale=None)
     now_s = [100.0]
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     jobs = Jobs(queue, 1)
@@ -273,7 +277,7 @@ def test_a_batch_system_that_takes_no_job_ends_the_batch(monkeypatch: pytest.Mon
     now_s[0] += TAKEN_S + 1
     with pytest.raises(RigError, match="the batch system takes no job; its reason is above"):
         jobs.renew()
-    queue.workers["S-1"] = None
+    job.job_id = "7"
     jobs.renew()
 
 
