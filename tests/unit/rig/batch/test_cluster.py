@@ -242,7 +242,7 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
     workers = {"tcp://1": {"name": "S-1-0"}, "tcp://2": {"name": "S-1-1"}, "tcp://3": {"name": "S-10"}}
     jobs_there = {name: SimpleNamespace(job_id="7") for name in ("S-1", "S-10", "S-2")}
     queue = SimpleNamespace(
-        worker_spec=dict.fromkeys(jobs_there, {}),
+        worker_spec={name: {} for name in jobs_there},
         workers=jobs_there,
         scheduler_info={"workers": workers},
         scale=lambda jobs: asked.append(jobs),
