@@ -133,11 +133,10 @@ def run_batch(
             aborted = True
         except Exception as error:  # the table is written all the same
             _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
-        # Alone first: what a shard has done that was not alone any more is in the list then.
-        alone = store.alone() if shard[1] > 1 else True
         total, only = len(store.cases), shard[1] == 1
+        # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
         there = set() if only else store.finished()
-        packed = only or (alone and len(there) == total)
+        packed = only or (store.alone() and len(there := store.finished()) == total)
         if packed:
             try:
                 there = store.pack()

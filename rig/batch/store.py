@@ -12,6 +12,7 @@ The bytes of the table do not depend on how many workers there were, in which or
 was interrupted.
 """
 
+import contextlib
 import json
 import os
 import shutil
@@ -218,22 +219,27 @@ def read_rows(folder: Path) -> Iterator[Row]:
         listed = (folder / LIST).read_text(encoding="utf-8").splitlines()
     except OSError as error:
         raise UsageError(f"{folder} has no study; name the folder that `rig batch` wrote") from error
+    # Files before the table: somebody else may pack now, who writes the table first and then removes the files.
+    found = {name: read_result(file, name) for name, file in _results(folder).items()}
     packed = {each[CASE]: each for each in _lines(folder / TABLE) if CASE in each}
     measured = {each[CASE]: each[MEASURED] for each in _lines(folder / MEASUREMENTS)}
-    files = _results(folder)
     for line in listed:
         case = json.loads(line)
         name = case[CASE]
         if name in packed:
             yield Row(name, case["labels"], packed[name][RESULT], measured.get(name, {}))
-        elif name in files and (found := read_result(files[name], name)) is not None:
-            yield Row(name, case["labels"], found[RESULT], found[MEASURED])
+        elif (one := found.get(name)) is not None:
+            yield Row(name, case["labels"], one[RESULT], one[MEASURED])
 
 
 def _results(folder: Path) -> dict[str, Path]:
     """Files of results by the names of their cases. A shared folder shows new files sooner when it is listed than when
     they are asked for by name."""
-    return {file.stem: file for file in (folder / CASES).glob("*/*.json")}
+    results: dict[str, Path] = {}
+    with contextlib.suppress(FileNotFoundError):  # removed meanwhile, so all are in the table
+        for part in list((folder / CASES).iterdir()):
+            results.update((file.stem, file) for file in part.iterdir() if file.suffix == ".json")
+    return results
 
 
 def read_failures(folder: Path) -> list[dict[str, Any]]:

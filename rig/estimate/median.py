@@ -6,6 +6,7 @@ with reference the position of the column's line at a fixed depth, so that the s
 are float32 (rows, columns). Missing answers (NaN) are ignored, not filled.
 """
 
+import math
 from dataclasses import replace
 
 import numba
@@ -17,8 +18,12 @@ from rig.simd import Float32, Float64
 REACH = 2
 MEDIAN_EFFICIENCY = 1.2533
 """Standard deviation of a median over that of a mean, sqrt(pi / 2), for normal errors."""
-SURE = np.float32(0.999999)
-"""Largest confidence used in the probability that none of several answers is right: log(1 - SURE) is finite."""
+SURE = 0.999999
+"""Largest confidence used, and 1 - SURE the smallest, so that log odds are finite."""
+NEUTRAL = 0.3
+"""Confidence of an answer that says nothing about its neighbours. With less, agreement makes them less sure: where
+nothing is lit, weak answers agree as well, for example at the end of the depth range."""
+NEUTRAL_LOG_ODDS = math.log(NEUTRAL / (1.0 - NEUTRAL))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -45,18 +50,19 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
             median = values[m // 2] if m % 2 else np.float32(0.5) * (values[m // 2 - 1] + values[m // 2])
             total = 0.0
             agreeing = 0.0
-            none_right = 0.0
+            log_odds = NEUTRAL_LOG_ODDS
             number = 0
             spread = 0.0
             for i in range(m):
                 total += weights[i]
                 if abs(values[i] - median) <= 1.0:
                     agreeing += weights[i]
-                    none_right += np.log1p(-min(weights[i], SURE))
+                    sure = min(max(float(weights[i]), 1.0 - SURE), SURE)
+                    log_odds += np.log(sure / (1.0 - sure)) - NEUTRAL_LOG_ODDS
                     number += 1
                     spread += (values[i] - median) ** 2
             out[0, y, c] = median
-            right = agreeing / max(number, 1) if coupled else -np.expm1(none_right)
+            right = agreeing / max(number, 1) if coupled else 1.0 / (1.0 + np.exp(-log_odds))
             out[1, y, c] = right * agreeing / total if total > 0.0 else 0.0
             out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / max(number, 1) + 1.0 / 12.0) / max(number, 1))
 
@@ -66,9 +72,10 @@ def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool 
 
     reference_px: (rows, columns), the position of the column's line at a fixed depth. Where it or x_px is NaN, the
     result is NaN and has confidence 0. The new confidence is a product. First factor: the share of the confidence in
-    the 5x5 that belongs to answers within 1 px of the median. Second factor: the probability that at least one of these
-    answers is right; if `coupled`, their mean confidence, since answers that influence each other also agree where
-    nothing is lit. x_sd_px becomes the standard deviation of a median of these answers.
+    the 5x5 that belongs to answers within 1 px of the median. Second factor: the probability that these answers are
+    right if each is independent evidence of it, odds = odds of NEUTRAL x product of (odds of the answer / odds of
+    NEUTRAL); if `coupled`, their mean confidence, since answers that influence each other are no such evidence. x_sd_px
+    becomes the standard deviation of a median of these answers.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

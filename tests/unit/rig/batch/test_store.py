@@ -214,6 +214,23 @@ def test_shards_that_start_at_once_all_begin(tmp_path: Path) -> None:
         store.close()
 
 
+@pytest.mark.parametrize("listed", [False, True])
+def test_rows_are_whole_while_somebody_packs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: bool) -> None:
+    with Store(tmp_path / "out", squares(20)) as store:
+        do(store, store.names)
+        results = module._results
+
+        def pack_meanwhile(folder: Path) -> dict[str, Path]:
+            monkeypatch.setattr(module, "_results", results)
+            before = results(folder)
+            store.pack()
+            return before if listed else results(folder)
+
+        monkeypatch.setattr(module, "_results", pack_meanwhile)
+        assert len(list(read_rows(store.folder))) == 20
+        assert results(store.folder) == {}, "the folder of single results is gone"
+
+
 def test_where_the_file_system_has_no_locks_it_works_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*given: object) -> None:
         raise OSError(38, "Function not implemented")

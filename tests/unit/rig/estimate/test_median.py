@@ -1,3 +1,4 @@
+import math
 import warnings
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.estimate.median import median_filter
+from rig.estimate.median import NEUTRAL, median_filter
 from rig.geometry.stripe_table import StripeTable
 
 
@@ -45,12 +46,34 @@ def test_light_stays_and_confidence_is_the_agreement_of_the_neighbours():
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     window = before.x_px[2:7, 2:7]
     agree = np.abs(window - np.median(window)) <= 1.0
-    assert after.confidence[4, 4] == pytest.approx(np.mean(agree) * (1 - 0.3 ** agree.sum()), rel=1e-5)
+    assert after.confidence[4, 4] == pytest.approx(np.mean(agree) * together([0.7] * agree.sum()), rel=1e-5)
     even = median_filter(table(np.full((9, 9), 7.0)), np.zeros((9, 9)))
     np.testing.assert_allclose(even.confidence, 1.0, atol=1e-4)
     assert np.all(even.x_sd_px < before.x_sd_px)
     np.testing.assert_array_equal(before.x_px, x)
     assert not np.array_equal(after.x_px, x)
+
+
+def together(confidences):
+    """Probability by Bayes' rule of what has a prior of NEUTRAL, after independent evidence."""
+    odds = [p / (1 - p) for p in confidences]
+    neutral = NEUTRAL / (1 - NEUTRAL)
+    ratio = neutral * math.prod(each / neutral for each in odds)
+    return ratio / (1 + ratio)
+
+
+def test_one_answer_keeps_its_confidence_weak_ones_that_agree_lose_it_and_others_gain():
+    for confidence in (0.05, 0.3, 0.9):
+        single = np.full((5, 5), np.nan)
+        single[2, 2] = 7.0
+        before = table(single)
+        before.confidence[:] = confidence
+        assert median_filter(before, np.zeros((5, 5))).confidence[2, 2] == pytest.approx(confidence, rel=1e-5)
+    for confidence, least, most in ((0.0, 0, 1e-9), (0.1, 0, 1e-9), (0.3, 0.3, 0.3), (0.5, 0.999, 1), (1.0, 1, 1)):
+        before = table(np.full((5, 5), 7.0))
+        before.confidence[:] = confidence
+        found = median_filter(before, np.zeros((5, 5))).confidence[2, 2]
+        assert least - 1e-6 <= found <= most + 1e-6
 
 
 def test_answers_that_go_by_each_other_are_no_surer_because_they_agree():
@@ -59,6 +82,6 @@ def test_answers_that_go_by_each_other_are_no_surer_because_they_agree():
     np.testing.assert_allclose(median_filter(before, np.zeros((9, 9)), coupled=True).confidence, 0.1, rtol=1e-5)
     before.confidence[4, 4] = 1.0
     alone = median_filter(before, np.zeros((9, 9)))
-    assert alone.confidence[4, 4] == pytest.approx(1.0, abs=1e-4)
-    assert alone.confidence[0, 0] == pytest.approx(1 - 0.9**9, rel=1e-5)
+    assert alone.confidence[4, 4] == pytest.approx(together([0.1] * 24 + [0.999999]), rel=1e-2)
+    assert alone.confidence[0, 0] == pytest.approx(together([0.1] * 9), rel=1e-5)
     assert median_filter(before, np.zeros((9, 9)), coupled=True).confidence[4, 4] == pytest.approx(3.4 / 25, rel=1e-5)
