@@ -89,24 +89,27 @@ class Cluster:
     @property
     def workers(self) -> int:
         """Number of threads of all workers that can do cases; 0 while there is no connection to the scheduler."""
-        now_s = time.monotonic()
-        if now_s - self._looked_s >= LOOK_S:
-            self._looked_s = now_s
-            try:
-                connected = self._client.status == "running"
-                threads = self._client.nthreads() if connected else {}
-                if connected:
-                    self._gone |= self._seen - set(threads)
-                    self._seen |= set(threads)
-                # A worker that holds something which no other can take stays there, retired or not.
-                self._threads = sum(number for each, number in threads.items() if each not in self._retired)
-            except (OSError, TimeoutError):
-                self._threads = 0
-            if self._threads:
-                self._with_workers_s = now_s
+        if time.monotonic() - self._looked_s >= LOOK_S:
+            self._count()
             if self._looked is not None:
                 self._looked()
         return self._threads
+
+    def _count(self) -> None:
+        """Count the workers, and note those that have gone."""
+        self._looked_s = time.monotonic()
+        try:
+            connected = self._client.status == "running"
+            threads = self._client.nthreads() if connected else {}
+            if connected:
+                self._gone |= self._seen - set(threads)
+                self._seen |= set(threads)
+            # A worker that holds something which no other can take stays there, retired or not.
+            self._threads = sum(number for each, number in threads.items() if each not in self._retired)
+        except (OSError, TimeoutError):
+            self._threads = 0
+        if self._threads:
+            self._with_workers_s = self._looked_s
 
     @property
     def notes(self) -> list[str]:
@@ -161,6 +164,8 @@ class Cluster:
         if self._client.status == "running" and self._under_way:
             with contextlib.suppress(OSError, TimeoutError):
                 self._client.cancel(list(self._under_way.values()), force=True)
+        elif self._seen:
+            self._count()  # for the notes: a worker may have gone since the last look
         self._under_way.clear()
         if self._close is not None:
             self._close()
