@@ -1,6 +1,6 @@
 """Guided sessions of a second simulator: does a pose bring what the guide forecasts?
 
-    python -m tests.campaigns.calibration.guided --sessions 20 [--first 0]
+    python -m tests.campaigns.calibration.guided --sessions 20 [--first 0] [--workers 2]
 
 Random rigs show three poses that begin well, then those that the guide asks for, at three speeds by turns. After each
 the depth error that its verdict expects is compared with what was forecast before it was shown. To save time the guide
@@ -9,7 +9,7 @@ chooses among 48 random ones of its poses. Some 20 s CPU a session.
 
 import argparse
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from calibration.errors import CalibrationError
 from calibration.guide import Forecast, candidates, next_pose, rough_camera, sequence
 from calibration.rig_fit.fit import RigFit, fit_rig
 from calibration.views import View
+from rig.batch.case import Case
+from tests.campaigns.studies import add_options, results_of
 from tests.reference.boards.calibration_data import BOARD, TrueRig, ViewErrors, random_rig, seen_view
 
 AT_M = 5.0
@@ -68,6 +70,11 @@ def session(seed: int) -> Iterator[Step]:
         views.append(seen_view(rng, rig, pose.rotation, pose.position_m, seen, (swept, -swept), f"{len(views):03d}"))
 
 
+def one_session(seed: int) -> dict[str, Any]:
+    """The steps of one session, as a case."""
+    return {"steps": list(session(seed))}
+
+
 def _fitted(views: list[View], rig: TrueRig) -> RigFit | None:
     try:
         return fit_rig(views, BOARD, (rig.width, rig.height))
@@ -80,10 +87,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
+    add_options(parser)
     asked = parser.parse_args()
     steps: list[Step] = []
-    for seed in range(asked.first, asked.first + asked.sessions):
-        found = list(session(seed))
+    seeds = range(asked.first, asked.first + asked.sessions)
+    cases = [Case("tests.campaigns.calibration.guided:one_session", {"seed": seed}, {"seed": seed}) for seed in seeds]
+    for seed, result in zip(seeds, results_of(cases, asked.workers, asked.out), strict=True):
+        found = [] if result is None else [Step(*step) for step in result["steps"]]  # one that failed has been told
         said = ", ".join(f"{1e3 * step.forecast_m:.2f}/{1e3 * step.expected_m:.2f}" for step in found)
         print(f"{seed}: forecast/expected {said} mm", flush=True)
         steps += found
