@@ -12,7 +12,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +20,7 @@ from calibration.files.sections import load_yaml
 from drivers.recorded.contents import INDEX_FILE
 from rig.errors import UsageError
 from rig.kernel_cache import TOP
-from rig.run_folder.manifest import MANIFEST
+from rig.run_folder.manifest import MANIFEST, package_versions
 from rig.run_folder.plain_json import json_line
 
 OWN_PACKAGES: Final = "calibration", "config", "drivers", "rig", "sim_backend", "spadrig"
@@ -95,13 +94,7 @@ def package_of(function: str) -> str:
 
 def numeric_versions() -> dict[str, str]:
     """Versions of the interpreter and of NUMERIC_PACKAGES."""
-    found = {"python": ".".join(map(str, sys.version_info[:2]))}
-    for name in NUMERIC_PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # installed under another name, as distributions repackage it
-            continue
-    return found
+    return {"python": ".".join(map(str, sys.version_info[:2])), **package_versions(*NUMERIC_PACKAGES)}
 
 
 def checksum(path: str) -> str:

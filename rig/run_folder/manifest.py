@@ -8,6 +8,8 @@ import json
 import zlib
 from collections.abc import Mapping
 from enum import StrEnum
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -31,6 +33,19 @@ Section = dict[str, Any] | None
 Frames = Annotated[list[int], Field(min_length=3, max_length=3)]
 RunGap = tuple[int, int, int]
 """Number of the start of the SPAD, and first and last missing frame."""
+
+
+def package_versions(*names: str) -> dict[str, str]:
+    """Versions of installed packages, without those that have another name here, as distributions repackage some."""
+    return {name: text for name in names if (text := _version_of(name)) is not None}
+
+
+@cache
+def _version_of(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 class RunVerdict(StrEnum):

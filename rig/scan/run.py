@@ -10,8 +10,6 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -28,7 +26,7 @@ from rig.recording.segment import Space
 from rig.recording.writer import Recording
 from rig.run_folder.disk import CLAIM_FILE
 from rig.run_folder.folder import Rays, RunFolder, SavePolicy
-from rig.run_folder.manifest import UNFINISHED, RunVerdict, file_crc32
+from rig.run_folder.manifest import UNFINISHED, RunVerdict, file_crc32, package_versions
 from rig.run_folder.summary import MapTally, RunFrames, Summary, Synchronisation
 from rig.scan.control_check import ControlCheck
 from rig.scan.on_request import PartsRecording, RecordingSwitch
@@ -235,18 +233,8 @@ class Run:
 
 def versions() -> dict[str, str]:
     """Versions of the program and of the packages on which its results depend."""
-    names = ("spadrig", "numpy", "numba", "opencv-contrib-python-headless")
-    found = {name: text for name in names if (text := _version_of(name)) is not None}
-    return {"python": platform.python_version(), **found}
-
-
-@cache
-def _version_of(package: str) -> str | None:
-    """The version of an installed package. None if it has another name here, as distributions repackage some."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    packages = package_versions("spadrig", "numpy", "numba", "opencv-contrib-python-headless")
+    return {"python": platform.python_version(), **packages}
 
 
 def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Sequence[Gap] = ()) -> RunFrames:

@@ -115,7 +115,7 @@ def test_the_digest_of_the_code_sees_our_sources_and_those_of_the_cases(
         (tmp_path / "rig" / "__pycache__" / "left.py").write_text("x = 1")
         (tmp_path / "rig" / "notes.txt").write_text("not code")
         assert look() == now
-        monkeypatch.setattr(module, "version", lambda name: "0.0.1")
+        monkeypatch.setattr(module, "package_versions", lambda *names: dict.fromkeys(names, "0.0.1"))
         assert set(look().values()).isdisjoint(now.values())
     finally:
         code_digest.cache_clear()
