@@ -126,7 +126,7 @@ def changed_file(files: Mapping[str, str]) -> str | None:
     for path, wanted in files.items():
         try:
             top = Path(path)
-            stats = [(str(each), each.stat()) for each in [top, *sorted(top.rglob("*"))]]
+            stats = [(str(each), each.stat()) for each in _decisive(top)]
             stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
             if _known.get(path, ([], ""))[0] != stamp:
                 _known[path] = stamp, checksum(path)
@@ -135,6 +135,14 @@ def changed_file(files: Mapping[str, str]) -> str | None:
         if _known[path][1] != wanted:
             return path
     return None
+
+
+def _decisive(top: Path) -> list[Path]:
+    """The files and folders whose sizes and times tell whether a path has changed: of a recording, whose files may be
+    very many, those that have the checksums of all others."""
+    if (top / INDEX_FILE).exists():
+        return [each for each in (top / MANIFEST, top / INDEX_FILE) if each.exists()]
+    return [top, *sorted(top.rglob("*"))]
 
 
 def files_of(config: Mapping[str, Any], scene: str | None = None) -> tuple[str, ...]:

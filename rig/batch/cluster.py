@@ -1,7 +1,8 @@
 """An executor that sends cases to the workers of a dask cluster (dask.distributed).
 
-A task returns only its name and how it ended; results are files in a folder that all workers must see. So a worker that
-is lost takes nothing with it. Each thread of a dask worker has a process of its own for the cases, which can be ended
+A case returns only its name and how it ended; results are files in a folder that all workers must see. So a worker that
+is lost takes nothing with it. One scheduler takes a few hundred tasks a second; therefore quick cases are sent in
+parcels, some cases as one task. Each thread of a dask worker has a process of its own for the cases, which can be ended
 when a case hangs or takes too much memory. A worker with another version of the code, or without the folder, is retired
 as soon as it shows; its cases go to others.
 """
@@ -12,7 +13,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import count
 from pathlib import Path
@@ -33,7 +34,12 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 AHEAD: Final = 2
-"""Tasks that are sent ahead for each thread of a worker, so that none waits for the network."""
+"""Parcels that are sent ahead for each thread of a worker, so that none waits for the network."""
+PARCEL_S: Final = 2.0
+"""Seconds that a parcel takes: long for a scheduler, which needs 3 ms for each, and short for somebody who waits."""
+MOST_IN_PARCEL: Final = 100
+MEMORY: Final = 0.05
+"""Share of the newest case in the mean time of a case."""
 PATIENCE_S: Final = 300.0
 """Seconds to wait for a scheduler that has gone away."""
 NO_WORKER_S: Final = 60.0
@@ -71,8 +77,11 @@ class Cluster:
         self._client = client
         self._close, self._looked = close, looked
         self._limits = limits or Limits()
-        self._ended: SimpleQueue[tuple[str, Future[Any]]] = SimpleQueue()
-        self._under_way: dict[str, Future[Any]] = {}
+        self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._parcel: list[Task] = []
+        self._sent: dict[str, tuple[Future[Any], list[str]]] = {}
+        self._under_way = 0
+        self._case_s = PARCEL_S
         self._attempt = count()
         self._threads = 0
         self._looked_s = float("-inf")
@@ -125,15 +134,27 @@ class Cluster:
         """Number of tasks that it takes now."""
         if self._client.status != "running":
             return 0
-        return max(1, AHEAD * self.workers) - len(self._under_way)
+        return max(1, AHEAD * self.workers) * self._size - self._under_way
+
+    @property
+    def _size(self) -> int:
+        """Number of cases in a parcel."""
+        return max(1, int(min(MOST_IN_PARCEL, PARCEL_S / max(self._case_s, 1e-6))))
 
     def submit(self, task: Task) -> None:
-        """Send a task."""
+        """Put a task into a parcel, and send that if it is full; `wait` sends it otherwise."""
+        self._parcel.append(task)
+        self._under_way += 1
+        if len(self._parcel) >= self._size:
+            self._send()
+
+    def _send(self) -> None:
+        tasks, self._parcel = self._parcel, []
         # Another key each time: the scheduler may still know a task whose connection broke.
-        key = f"case-{task.name}-{next(self._attempt)}"
-        future = self._client.submit(_on_worker, task, self._limits, key=key, pure=False)
-        self._under_way[task.name] = future
-        future.add_done_callback(lambda ended, name=task.name: self._ended.put((name, ended)))
+        key = f"cases-{tasks[0].name}-{next(self._attempt)}"
+        future = self._client.submit(_do, tasks, self._limits, key=key, pure=False)
+        self._sent[key] = future, [task.name for task in tasks]
+        future.add_done_callback(self._ended.put)
 
     def wait(self) -> list[Ended]:
         """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone, or all
@@ -142,31 +163,36 @@ class Cluster:
             raise RigError("the scheduler is gone; start it, then run this again: it goes on where it stopped")
         if self._retired and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
             raise UsageError("no worker is left", *self.notes)
-        ended: list[tuple[str, Future[Any]]] = []
+        if self._parcel and self._client.status == "running":
+            self._send()
+        futures: list[Future[Any]] = []
         try:
-            ended.append(self._ended.get(timeout=LOOK_S))
+            futures.append(self._ended.get(timeout=LOOK_S))
             while True:
-                ended.append(self._ended.get_nowait())
+                futures.append(self._ended.get_nowait())
         except Empty:
             pass
-        mine = [(name, future) for name, future in ended if self._under_way.get(name) is future]
-        for name, _ in mine:
-            del self._under_way[name]
+        mine = [(future, sent[1]) for future in futures if (sent := self._sent.pop(str(future.key), None)) is not None]
         try:
-            told = self._client.gather([f for _, f in mine if f.status == "finished"], errors="skip")
+            told = self._client.gather([f for f, _ in mine if f.status == "finished"], errors="skip")
         except (OSError, TimeoutError):
             told = []
-        found = {each.name: each for each in told}
-        return [self._judged(found.get(name) or _lost(name, future)) for name, future in mine]
+        found = {each.name: each for parcel in told for each in parcel}
+        ended = [self._judged(found.get(name) or _lost(name, future)) for future, names in mine for name in names]
+        self._under_way -= len(ended)
+        for each in ended:
+            if each.seconds:
+                self._case_s += MEMORY * (each.seconds - self._case_s)
+        return ended
 
     def close(self) -> None:
         """Give up what is under way, and close what was opened for this executor."""
-        if self._client.status == "running" and self._under_way:
+        if self._client.status == "running" and self._sent:
             with contextlib.suppress(OSError, TimeoutError):
-                self._client.cancel(list(self._under_way.values()), force=True)
+                self._client.cancel([future for future, _ in self._sent.values()], force=True)
         elif self._seen:
             self._count()  # for the notes: a worker may have gone since the last look
-        self._under_way.clear()
+        self._sent.clear()
         if self._close is not None:
             self._close()
             self._close = None
@@ -293,6 +319,11 @@ def _batch_system(file: Path) -> tuple[Any, int]:
         raise UsageError(f"{file}: {error}; its other keys are those of dask_jobqueue.{name}") from error
     made.scale(jobs=jobs)
     return made, jobs
+
+
+def _do(parcel: Sequence[Task], limits: Limits) -> list[Ended]:
+    """Do the tasks of a parcel, on a worker."""
+    return [_on_worker(task, limits) for task in parcel]
 
 
 def _on_worker(task: Task, limits: Limits) -> Ended:

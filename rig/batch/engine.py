@@ -7,6 +7,7 @@ is written with all results that there are.
 import contextlib
 import logging
 import time
+from array import array
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -192,7 +193,7 @@ class _Runs:
         self._lost: Counter[str] = Counter()
         self.failed: dict[str, Ended] = {}
         self.done: set[str] = set()
-        self.times_s: list[float] = []
+        self.times_s = array("d")
         self.most = 0
         self.stopped = ""
 
@@ -214,15 +215,16 @@ class _Runs:
             return
         self.under_way.discard(name)
         self.times_s.append(ended.seconds)
+        if ended.status == "done":
+            self.done.add(name)
+            return
         if ended.status == "lost":
             self._lost[name] += 1
             again = self._lost[name] <= LOST
         else:
             self.attempts[name] += 1
             again = ended.status in ("died", "hung", "memory") and self.attempts[name] <= self._retries
-        if ended.status == "done":
-            self.done.add(name)
-        elif again:
+        if again:
             self.waiting.append(name)
         else:
             self.failed[name] = ended
@@ -296,4 +298,4 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
         if first.status == "other code":
             raise UsageError("the program was changed while cases were tried; run the command again")
         raise UsageError(f"case {first.name} fails: {first.message}")
-    return runs.times_s[1:] or runs.times_s  # in the first one the process loads compiled code
+    return list(runs.times_s[1:] or runs.times_s)  # in the first one the process loads compiled code

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 
-from drivers.clock import VirtualClock
+from drivers.clock import VirtualClock, now_s
 from drivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from drivers.guard import GuardLimits
 from drivers.interfaces import SpadCounters, SpadTiming
@@ -184,15 +184,18 @@ class Acquisition:
         if asked.recording is not None:
             asked.recording.begin(sweeps)
         trouble: list[str] = []
+        started_s = 0.0
         try:
             try:
                 self._arm_laser()
                 if times is not None:
                     times.ask()
                 rig.spad.start(self._burst_frames(sweeps))
+                begun_s = now_s(rig.clock)
                 self._pipeline = pipeline
                 rig.sync.run()
                 rig.scanner.start()
+                started_s = now_s(rig.clock) - begun_s
                 pipeline.start()
                 while pipeline.maps.streaming:
                     if (found := pipeline.maps.take_streaming(TELL_S)) is not None:
@@ -216,6 +219,7 @@ class Acquisition:
                     yield found
                 self._tell(assembler, done)
             if (failure := pipeline.error()) is not None:
+                self._note_late_scanner(failure, sweeps, started_s)
                 raise failure
             if trouble:
                 raise DevicesError("\n".join(trouble))
@@ -226,6 +230,21 @@ class Acquisition:
             raise
         finally:
             self._end_start(pipeline, assembler)
+
+    def _note_late_scanner(self, failure: BaseException, sweeps: int, started_s: float) -> None:
+        """Add a line to an error if it is the computer's fault that a burst was over before its sweeps were.
+
+        started_s: time from the SPAD's start until the scanner had started, in seconds.
+        """
+        frames = self._burst_frames(sweeps)
+        if frames is None:
+            return
+        room_s = (frames - self._plan.frames_for(sweeps)) / float(self._plan.frame_rate_hz)
+        if started_s > room_s:
+            failure.add_note(
+                f"{self._rig.scanner.name} started {started_s:.2g} s after the SPAD, whose burst leaves {room_s:.2g} s "
+                "for that; free the computer, or its network to the scanner"
+            )
 
     def _darken(self) -> None:
         """Take the gate low and pause the laser on the thread of a scanner that has failed: the caller's may be at work

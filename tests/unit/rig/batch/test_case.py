@@ -81,6 +81,22 @@ def test_a_changed_file_is_found_and_unchanged_ones_are_not_read_again(
     assert changed_file(files) == str(one)
 
 
+def test_whether_a_recording_has_changed_is_seen_without_a_look_at_all_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index = tmp_path / INDEX_FILE
+    index.write_text("checksums of all blocks")
+    (tmp_path / "frames.bin").write_text("0000")
+    files = {str(tmp_path): checksum(str(tmp_path))}
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rglob", lambda *given: pytest.fail("all files were listed"))
+        patched.setattr(module, "checksum", lambda path: files[path])
+        assert changed_file(files) is None
+    index.write_text("checksums of other blocks")
+    assert changed_file(files) == str(tmp_path)
+    assert changed_file({str(tmp_path / "gone"): "1"}) == str(tmp_path / "gone")
+
+
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot read .*none: No such file or directory; correct the path"):
         checksum(str(tmp_path / "none"))

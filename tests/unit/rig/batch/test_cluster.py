@@ -16,7 +16,7 @@ import pytest
 
 from rig.batch import cluster as module
 from rig.batch.case import Case, checksum
-from rig.batch.cluster import JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect
+from rig.batch.cluster import AHEAD, JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect
 from rig.batch.engine import Batch, run_batch
 from rig.batch.pool import Limits
 from rig.batch.store import Store
@@ -281,16 +281,39 @@ def test_a_batch_system_that_takes_no_job_ends_the_batch(monkeypatch: pytest.Mon
     jobs.renew()
 
 
-def test_a_task_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:
-    with Store(tmp_path / "out", squares(1)) as store:
+def test_quick_cases_are_sent_in_parcels_and_trouble_in_one_is_its_own(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parcels: list[int] = []
+    send = Cluster._send
+
+    def noted(self: Cluster) -> None:
+        parcels.append(len(self._parcel))
+        send(self)
+
+    monkeypatch.setattr(Cluster, "_send", noted)
+    ill = [*troubles("raise", tmp_path / "raise"), *troubles("die", tmp_path / "die", times=1)]
+    all_ = squares(300)
+    done = run(tmp_path / "out", [*all_[:150], *ill, *all_[150:]], client)
+    assert parcels[0] == 1
+    assert max(parcels) > 10
+    assert sum(parcels) == 302
+    assert {each.kind for each in done.failures} == {"raised", "died"}
+    assert done.done == 300
+
+
+def test_a_parcel_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:
+    with Store(tmp_path / "out", squares(2)) as store:
         executor = Cluster(store, client)
-        task = store.task(store.names[0])
-        executor.submit(task)
-        executor.submit(task)
+        for name in store.names:
+            executor.submit(store.task(name))
+        (future, _), *_ = executor._sent.values()
         told: list[Ended] = []
         until_s = time.monotonic() + 20
-        while not told and time.monotonic() < until_s:
+        while len(told) < 2 and time.monotonic() < until_s:
             told += executor.wait()
+        executor._ended.put(future)  # as after a broken connection
         told += executor.wait()
+        assert executor.room == AHEAD * 2
         executor.close()
-    assert [each.status for each in told] == ["done"]
+    assert [each.status for each in told] == ["done", "done"]

@@ -250,6 +250,18 @@ def test_bursts_are_taken_in_groups_and_numbered_through():
     assert rig.spad.n_frames <= 900
 
 
+@pytest.mark.parametrize(("started_s", "late"), [(0.001, False), (2.0, True)])
+def test_a_burst_that_is_over_before_its_sweep_is_laid_to_a_scanner_that_started_late(started_s, late):
+    plan = plan_of(scan(columns=40), LAG, spad=dataclasses.replace(SPAD, stream=None, burst=BurstMode(900, 1e6)))
+    rig, log = fake_rig(plan, [SimpleNamespace(blocks=lambda *_: [])])
+    rig.scanner.start = lambda: rig.clock.sleep(started_s)
+    with pytest.raises(DeviceFault, match="without the scan marker that closes the last one") as failed:
+        list(acquisition(rig, plan, 1).run())
+    notes = getattr(failed.value, "__notes__", [])
+    assert [note.partition(",")[0] for note in notes] == late * ["scanner started 2 s after the SPAD"]
+    assert log[-len(STOP) :] == STOP
+
+
 def test_sweeps_are_taken_in_groups_that_a_program_holds():
     rig, log = fake_rig(PLAN, [stream_of(PLAN, 2, lag=LAG), stream_of(PLAN, 1, lag=LAG)])
     rig.sync.most = 2
