@@ -92,7 +92,9 @@ class ReconstructRequest:
     """Depth maps of existing frames (`rig reconstruct`)."""
 
     estimator: str | None = option(None, "auto, argmax, edge, likelihood or joint", unset="as configured, else auto")
-    filter: str | None = option(None, "none or median (5 x 5)", unset="as configured, else none")
+    filter: str | None = option(
+        None, "none or median (5 x 5; for edge and likelihood, not for joint)", unset="as configured, else none"
+    )
     min_confidence: float | None = option(None, "least confidence in the depth map", unset="as configured, else 0.5")
     accept_calibration: bool = _accept_calibration()
     out: str | os.PathLike[str] | None = _out()

@@ -100,23 +100,29 @@ def numeric_versions() -> dict[str, str]:
 def checksum(path: str) -> str:
     """Checksum of a file, or of all files in a folder. Raises UsageError if it cannot be read.
 
-    Frames of a recording are not read. Its manifest and index are, which have the checksums of all blocks.
+    Of a recording, frames count by the sizes of their files and by the index, and maps that were made of it do not
+    count.
     """
     top = Path(path)
     try:
         if not top.is_dir():
             return _checksum_of_file(top)
         recorded = (top / INDEX_FILE).exists()
+        files = (file for name in _READ for file in top.glob(name)) if recorded else top.rglob("*")
         lines = []
-        for file in sorted(each for each in top.rglob("*") if each.is_file()):
-            read = not recorded or file.name in (MANIFEST, INDEX_FILE)
-            what = _checksum_of_file(file) if read else str(file.stat().st_size)
+        for file in sorted(each for each in files if each.is_file()):
+            what = str(file.stat().st_size) if recorded and file.match(_FRAMES) else _checksum_of_file(file)
             lines.append(f"{file.relative_to(top)} {what}\n")
         return hashlib.sha256("".join(lines).encode()).hexdigest()
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}; correct the path") from error
 
 
+_FEW: Final = MANIFEST, INDEX_FILE, "*.yaml", "*.npz"
+_FRAMES: Final = "frames-*"
+_READ: Final = *_FEW, _FRAMES, "learned/*", "truth/*"
+"""What a replay reads of a recording: plan, calibration and first learned state, frames, and what was kept for each
+map. `_FEW` are those of which there are few."""
 _known: dict[str, tuple[list[tuple[str, int, int]], str]] = {}
 """Checksums that were computed, with names, sizes and times of the files then."""
 
@@ -126,7 +132,7 @@ def changed_file(files: Mapping[str, str]) -> str | None:
     for path, wanted in files.items():
         try:
             top = Path(path)
-            stats = [(str(each), each.stat()) for each in _decisive(top)]
+            stats = [(str(each), each.stat()) for each in _watched(top)]
             stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
             if _known.get(path, ([], ""))[0] != stamp:
                 _known[path] = stamp, checksum(path)
@@ -137,11 +143,11 @@ def changed_file(files: Mapping[str, str]) -> str | None:
     return None
 
 
-def _decisive(top: Path) -> list[Path]:
-    """The files and folders whose sizes and times tell whether a path has changed: of a recording, whose files may be
-    very many, those that have the checksums of all others."""
+def _watched(top: Path) -> list[Path]:
+    """The files and folders whose sizes and times tell whether a path has changed. Of a recording, which may have very
+    many files on a slow disk, only a few."""
     if (top / INDEX_FILE).exists():
-        return [each for each in (top / MANIFEST, top / INDEX_FILE) if each.exists()]
+        return sorted(file for name in _FEW for file in top.glob(name))
     return [top, *sorted(top.rglob("*"))]
 
 

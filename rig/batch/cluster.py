@@ -10,6 +10,7 @@ as soon as it shows; its cases go to others.
 import contextlib
 import logging
 import os
+import secrets
 import socket
 import threading
 import time
@@ -24,10 +25,10 @@ from urllib.parse import urlsplit
 from calibration.errors import FileError
 from calibration.files.sections import load_yaml
 from drivers.optional_packages import install_command
-from rig.batch.case import checksum, code_digest
+from rig.batch.case import changed_file, checksum, code_digest
 from rig.batch.pool import Limits, Pool
 from rig.batch.store import Store
-from rig.batch.task import HEAD, Ended, Task
+from rig.batch.task import HEAD, Ended, Status, Task
 from rig.errors import RigError, UsageError
 
 if TYPE_CHECKING:
@@ -36,10 +37,14 @@ if TYPE_CHECKING:
 AHEAD: Final = 2
 """Parcels that are sent ahead for each thread of a worker, so that none waits for the network."""
 PARCEL_S: Final = 2.0
-"""Seconds that a parcel takes: long for a scheduler, which needs 3 ms for each, and short for somebody who waits."""
+"""Seconds that a parcel takes: long for a scheduler, which needs 3 ms for each, and short for somebody who waits. A
+worker gives back what it has not begun by then."""
 MOST_IN_PARCEL: Final = 100
-MEMORY: Final = 0.05
+"""Most cases of a parcel, however quick they are."""
+NEWEST_SHARE: Final = 0.05
 """Share of the newest case in the mean time of a case."""
+UNFIT: Final = frozenset({"other code", "other files", "no folder"})
+"""Ends of a case that say that its worker can do none."""
 PATIENCE_S: Final = 300.0
 """Seconds to wait for a scheduler that has gone away."""
 NO_WORKER_S: Final = 60.0
@@ -82,7 +87,9 @@ class Cluster:
         self._sent: dict[str, tuple[Future[Any], list[str]]] = {}
         self._under_way = 0
         self._case_s = PARCEL_S
-        self._attempt = count()
+        # Other batches on the same scheduler may have the same cases, and it does each key once.
+        self._keys = (f"parcel-{secrets.token_hex(8)}-{number}" for number in count())
+        self._codes, self._files = dict(store.codes), dict(store.checksums)
         self._threads = 0
         self._looked_s = float("-inf")
         self._with_workers_s = time.monotonic()
@@ -150,8 +157,7 @@ class Cluster:
 
     def _send(self) -> None:
         tasks, self._parcel = self._parcel, []
-        # Another key each time: the scheduler may still know a task whose connection broke.
-        key = f"cases-{tasks[0].name}-{next(self._attempt)}"
+        key = next(self._keys)
         future = self._client.submit(_do, tasks, self._limits, key=key, pure=False)
         self._sent[key] = future, [task.name for task in tasks]
         future.add_done_callback(self._ended.put)
@@ -181,8 +187,8 @@ class Cluster:
         ended = [self._judged(found.get(name) or _lost(name, future)) for future, names in mine for name in names]
         self._under_way -= len(ended)
         for each in ended:
-            if each.seconds:
-                self._case_s += MEMORY * (each.seconds - self._case_s)
+            if each.seconds:  # 0 if it was done already, or not begun
+                self._case_s += NEWEST_SHARE * (min(each.seconds, PARCEL_S) - self._case_s)
         return ended
 
     def close(self) -> None:
@@ -193,22 +199,32 @@ class Cluster:
         elif self._seen:
             self._count()  # for the notes: a worker may have gone since the last look
         self._sent.clear()
+        self._parcel.clear()
+        self._under_way = 0
         if self._close is not None:
             self._close()
             self._close = None
 
     def _judged(self, ended: Ended) -> Ended:
-        """A task that came back undone from a worker that cannot do any is to be begun again elsewhere."""
-        if ended.status not in ("other code", "other files", "no folder"):
+        """A task that came back undone from a worker that cannot do any is to be begun again elsewhere, unless the
+        fault is not the worker's: an input has been changed, or the code."""
+        if ended.status not in UNFIT or self._changed(ended.status):
             return ended
         note = f"worker {ended.worker} was retired: {ended.message}"
         address = ended.worker.partition(" ")[0]
         if address not in self._retired:
             _log.warning("%s", note)
+            with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
+                self._client.retire_workers([address], close_workers=True)
         self._retired[address] = note
-        with contextlib.suppress(OSError, TimeoutError):  # the connection breaks: the worker will come up again
-            self._client.retire_workers([address], close_workers=True)
         return Ended(ended.name, "lost", note)
+
+    def _changed(self, status: Status) -> bool:
+        """Whether what a worker has found is so here too."""
+        if status == "other files":
+            return changed_file(self._files) is not None
+        fresh = code_digest.__wrapped__  # without its cache
+        return status == "other code" and any(fresh(package) != code for package, code in self._codes.items())
 
 
 def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
@@ -322,8 +338,20 @@ def _batch_system(file: Path) -> tuple[Any, int]:
 
 
 def _do(parcel: Sequence[Task], limits: Limits) -> list[Ended]:
-    """Do the tasks of a parcel, on a worker."""
-    return [_on_worker(task, limits) for task in parcel]
+    """Do the tasks of a parcel on a worker, one after the other, as long as PARCEL_S allows to begin one."""
+    ends_s = time.monotonic() + PARCEL_S
+    done: list[Ended] = []
+    for task in parcel:
+        if done and (time.monotonic() > ends_s or done[-1].status in UNFIT):
+            done.append(Ended(task.name, "not begun"))
+            continue
+        try:
+            done.append(_on_worker(task, limits))
+        except Exception as error:  # too many open files, no room for another process: the next may succeed
+            _close_pool()
+            time.sleep(LOOK_S)  # others take cases meanwhile
+            done.append(Ended(task.name, "lost", f"its worker could not begin it: {error or type(error).__name__}"))
+    return done
 
 
 def _on_worker(task: Task, limits: Limits) -> Ended:
@@ -333,8 +361,7 @@ def _on_worker(task: Task, limits: Limits) -> Ended:
     name = f"{get_worker().address} {socket.gethostname()}"
     pool, its_limits = getattr(_of_thread, "pool", (None, None))
     if pool is None or its_limits != limits:  # the first task, or the first of another study
-        if pool is not None:
-            pool.close()
+        _close_pool()
         pool = Pool(1, limits, name)
         _of_thread.pool = pool, limits
     pool.submit(task)
@@ -343,12 +370,19 @@ def _on_worker(task: Task, limits: Limits) -> Ended:
     return ended[0]
 
 
+def _close_pool() -> None:
+    pool, _ = getattr(_of_thread, "pool", (None, None))
+    _of_thread.pool = None, None
+    if pool is not None:
+        pool.close()
+
+
 def _lost(name: str, future: "Future[Any]") -> Ended:
-    error = None
+    said = f"its worker is gone ({future.status})"
     if future.status == "error":
         with contextlib.suppress(OSError, TimeoutError):
-            error = future.exception(timeout=1)
-    return Ended(name, "lost", f"its worker is gone ({future.status if error is None else error})")
+            said = f"its worker failed ({future.exception(timeout=1)})"
+    return Ended(name, "lost", said)
 
 
 def _require_able(client: "Client", store: Store) -> None:

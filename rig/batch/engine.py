@@ -149,7 +149,7 @@ def run_batch(
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
     failures = tuple(
         Failure(
-            end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.attempts[end.name],
+            end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.tries(end.name),
             f"{command} --case {end.name}", end.detail,
         )
         for end in runs.failed.values()
@@ -178,7 +178,7 @@ def run_batch(
 def failure_line(failure: Mapping[str, Any]) -> str:
     """One line that says which case failed, with its settings, and how. failure: with the keys of `Failure`."""
     setting = ", ".join(f"{name} {value}" for name, value in failure["labels"].items())
-    times = "" if failure["attempts"] == 1 else f", {failure['attempts']} times"
+    times = "" if failure["attempts"] <= 1 else f", {failure['attempts']} times"
     return f"{setting or failure['case']}: {failure['kind']}{times}: {failure['message']}"
 
 
@@ -209,11 +209,18 @@ class _Runs:
                 self._end(ended)
             yield
 
+    def tries(self, name: str) -> int:
+        """How often a case was tried, or else lost."""
+        return self.attempts[name] or self._lost[name]
+
     def _end(self, ended: Ended) -> None:
         name = ended.name
         if name not in self.under_way:
             return
         self.under_way.discard(name)
+        if ended.status == "not begun":
+            self.waiting.appendleft(name)
+            return
         self.times_s.append(ended.seconds)
         if ended.status == "done":
             self.done.add(name)
@@ -259,12 +266,13 @@ class _Told:
             notes.append(f"{in_words(left_s)} left")
         if runs.failed:
             notes.append(f"{len(runs.failed)} failed")
+        # A line for each stage goes to where there is no terminal: one for each tenth of the cases.
+        stage = f"cases, {10 * (10 * done // max(1, self._total))} %"
         if not executor.workers:
+            stage = "no workers"
             notes.append("waiting for workers")
         elif not ended and runs.under_way and now_s - self._begun_s > PATIENT_S:
-            notes.append("the first cases load compiled code, which takes minutes where it is new")
-        # The stage changes with each tenth, since of each stage a line goes to where there is no terminal.
-        stage = f"cases, {10 * (10 * done // max(1, self._total))} %" if executor.workers else "no workers"
+            stage = "the first cases load compiled code, which takes minutes where it is new"
         tell_stage(stage, done, self._total, "done", ", ".join(notes))
         if self._progress is not None:
             self._progress(done, self._total)
@@ -290,7 +298,7 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
     runs = _Runs(scratch, executor, some, 0)
     try:
         for _ in runs.steps():
-            tell_stage("trying cases", len(runs.done), len(some), "done")
+            tell_stage("trying cases, which load compiled code first", len(runs.done), len(some), "done")
     finally:
         executor.close()
     if runs.failed:

@@ -94,7 +94,11 @@ class Pool:
 
     def submit(self, task: Task) -> None:
         """Begin a task; only if there is room."""
-        process = self._free.pop() if self._free else _Process(self._idle.pop(), self._limits)
+        if self._free:
+            process = self._free.pop()
+        else:
+            process = _Process(self._idle[-1], self._limits)
+            self._idle.pop()  # only now: the system may have refused another process
         self._busy.append(process)
         process.begin(task)
 
@@ -143,11 +147,17 @@ class _Process:
         self._ready = False
         self.alive = True
         path = os.pathsep.join(each or os.getcwd() for each in sys.path)
-        # A session of its own: Ctrl-C at the terminal is for the process that started this one.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "rig.batch.worker", name], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=self._printed, env={**os.environ, **ONE_THREAD, "PYTHONPATH": path}, start_new_session=True,
-        )  # fmt: skip
+        # Modules are those of this process, not what lies in the current folder.
+        env = {**os.environ, **ONE_THREAD, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+        try:
+            # A session of its own: Ctrl-C at the terminal is for the process that started this one.
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "rig.batch.worker", name], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=self._printed, env=env, start_new_session=True,
+            )  # fmt: skip
+        except BaseException:
+            self._printed.close()
+            raise
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._stdin, self.answers = self._process.stdin, self._process.stdout

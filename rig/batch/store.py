@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from rig.batch.case import MEASURED, Case, checksum, code_digest, numeric_versions, package_of
-from rig.batch.task import CASE, CASES, HEAD, RESULT, Task, read_result
+from rig.batch.task import CASE, CASES, FILES, HEAD, RESULT, SCRATCH, Task, read_result
 from rig.errors import UsageError
 from rig.run_folder.disk import hold, replace_file, sync_folder
 from rig.run_folder.plain_json import json_line, json_text
@@ -194,8 +194,10 @@ class Store:
         packed = {row.case for row in rows}
         for part in (self.folder / CASES).iterdir():
             for file in part.iterdir():
-                if file.stem in packed or file.suffix == ".part":
+                if file.stem in packed or file.suffix == SCRATCH:
                     file.unlink(missing_ok=True)
+        for scratch in (self.folder / FILES).glob(f".*{SCRATCH}"):  # of cases that were killed
+            shutil.rmtree(scratch, ignore_errors=True)
         if len(packed) == len(self.cases):
             shutil.rmtree(self.folder / CASES, ignore_errors=True)
         return packed

@@ -4,6 +4,7 @@ A result is a small file that appears whole and only once, whoever writes it fir
 and a case that was begun twice, because a connection broke, is in the table once.
 """
 
+import contextlib
 import errno
 import json
 import os
@@ -26,13 +27,25 @@ FILES: Final = "files"
 HEAD: Final = "study.json"
 CASE: Final = "case"
 RESULT: Final = "result"
+SCRATCH: Final = ".part"
+"""End of the names of files and folders that are not whole yet."""
 
 Status = Literal[
-    "done", "raised", "died", "hung", "memory", "cannot write", "other code", "other files", "no folder", "lost"
+    "done",
+    "raised",
+    "died",
+    "hung",
+    "memory",
+    "cannot write",
+    "other code",
+    "other files",
+    "no folder",
+    "lost",
+    "not begun",
 ]
 """The end of a case. died: its process ended; hung: it took too long; memory: it took too much; other code, other
 files, no folder: the worker has another version of the code or of what the case reads, or does not see the folder;
-lost: the connection to the worker broke."""
+lost: the connection to the worker broke; not begun: the worker gave it back."""
 
 _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 
@@ -57,7 +70,8 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The end of a task. message: one line. detail: the trace of an error. seconds: wall time of the case."""
+    """The end of a task. message: one line. detail: the trace of an error. seconds: wall time of the case; 0 if its
+    result was there already."""
 
     name: str
     status: Status
@@ -82,11 +96,14 @@ def perform(task: Task, worker: str = "") -> Ended:
         return Ended(task.name, "done", worker=worker)
     begun = time.monotonic()
     inputs = dict(task.inputs)
+    kept = folder / FILES / task.name
+    scratch = kept.with_name(f".{task.name}.{secrets.token_hex(4)}{SCRATCH}")
     if task.keeps:
-        inputs["keep"] = str(folder / FILES / task.name)
-        shutil.rmtree(inputs["keep"], ignore_errors=True)  # of an attempt that was interrupted
+        inputs["keep"] = str(scratch)
     try:
         result = dict(call(task.function, inputs))
+        if task.keeps and not file.exists():
+            _keep(scratch, kept)
         seconds = time.monotonic() - begun
         measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
         line = json_line({CASE: task.name, RESULT: result, MEASURED: measured})
@@ -99,12 +116,30 @@ def perform(task: Task, worker: str = "") -> Ended:
         full = isinstance(error, OSError) and error.errno in _NO_ROOM
         status: Status = "cannot write" if full else "raised"
         return Ended(task.name, status, message, traceback.format_exc(), time.monotonic() - begun, worker)
+    finally:
+        if task.keeps:
+            shutil.rmtree(scratch, ignore_errors=True)
     try:
         write_once(file, line)
     except OSError as error:
         said = f"cannot write {file}: {error.strerror}"
         return Ended(task.name, "cannot write", said, seconds=seconds, worker=worker)
     return Ended(task.name, "done", seconds=seconds, worker=worker)
+
+
+def _keep(scratch: Path, kept: Path) -> None:
+    """Give the files of a case their place. Those that are there already are of an attempt without a result: of one
+    that is under way elsewhere, or before a loss of power, which may have torn them."""
+    old = scratch.with_name(f"{scratch.name}.old{SCRATCH}")
+    while scratch.exists():
+        with contextlib.suppress(FileNotFoundError):
+            kept.rename(old)
+            shutil.rmtree(old, ignore_errors=True)
+        try:
+            scratch.rename(kept)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # another attempt was quicker
+                raise
 
 
 def result_file(folder: Path, name: str) -> Path:

@@ -193,7 +193,8 @@ class EstimateConfig(ConfigSection):
     )
     filter: Filter = Field(
         default="none",
-        description="what is done to the stripe positions afterwards: median is one of 5 x 5 rows and columns",
+        description="what is done to the stripe positions afterwards: median is one of 5 x 5 rows and columns, for "
+        "edge and likelihood",
         examples=["median"],
     )
     min_confidence: float = Field(

@@ -207,14 +207,17 @@ class Reconstructor:
                 f"estimator {self._name} gives {problem}; correct it: docs/how-to/plugin.md says what it owes"
             )
         fog, intensity = self._fog(sweep, stripe, used), sweep.intensity(workers)
-        doubts, stripe = self._checks.check(sweep, intensity, stripe)
+        doubts, checked = self._checks.check(sweep, intensity, stripe)
         doubts = (*sweep.doubts, *doubts)
-        if self._lines is not None:
-            stripe = share_claims(stripe, self._lines)
+        doubted, stripe = checked.confidence < stripe.confidence, checked
         if filter == "median":
             from rig.estimate.median import median_filter
 
-            stripe = median_filter(stripe, geometry.reference_px(), coupled=self._coupled)
+            stripe = median_filter(checked, geometry.reference_px(), coupled=self._coupled)
+            most = np.where(doubted, checked.confidence, np.float32(1))  # neighbours are no reason to believe it again
+            stripe = replace(stripe, confidence=np.minimum(stripe.confidence, most))
+        if self._lines is not None:  # after the filter, which makes answers surer
+            stripe = share_claims(stripe, self._lines)
         floating: int | None = None
         if self._model is None:
             depth = DepthMap.empty(geometry.rows, geometry.width)

@@ -22,13 +22,17 @@ SURE = 0.999999
 """Largest confidence used, and 1 - SURE the smallest, so that log odds are finite."""
 NEUTRAL = 0.3
 """Confidence of an answer that says nothing about its neighbours. With less, agreement makes them less sure: where
-nothing is lit, weak answers agree as well, for example at the end of the depth range."""
+nothing is lit, weak answers agree as well, for example at the end of the depth range. Chosen by trial: neighbours are
+not quite as independent as the formula takes them to be."""
 NEUTRAL_LOG_ODDS = math.log(NEUTRAL / (1.0 - NEUTRAL))
 
 
 @numba.njit(cache=True, nogil=True)
 def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Float32) -> None:
-    """Write every answer's median disparity, confidence and standard deviation to out (3, rows, columns)."""
+    """Write every answer's median disparity, confidence and standard deviation to out (3, rows, columns).
+
+    disparity: x minus reference. out: NaN, 0 and NaN before. For confidence and `coupled` see `median_filter`.
+    """
     rows, columns = disparity.shape
     values = np.empty((2 * REACH + 1) ** 2, np.float32)
     weights = np.empty((2 * REACH + 1) ** 2, np.float32)
@@ -62,20 +66,25 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
                     number += 1
                     spread += (values[i] - median) ** 2
             out[0, y, c] = median
-            right = agreeing / max(number, 1) if coupled else 1.0 / (1.0 + np.exp(-log_odds))
+            if number == 0:  # the middle between two answers that are far apart
+                out[2, y, c] = np.float32(0.5) * (values[m // 2] - values[m // 2 - 1])
+                continue
+            right = agreeing / number if coupled else 1.0 / (1.0 + np.exp(-log_odds))
             out[1, y, c] = right * agreeing / total if total > 0.0 else 0.0
-            out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / max(number, 1) + 1.0 / 12.0) / max(number, 1))
+            out[2, y, c] = MEDIAN_EFFICIENCY * np.sqrt((spread / number + 1.0 / 12.0) / number)
 
 
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
     """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
 
     reference_px: (rows, columns), the position of the column's line at a fixed depth. Where it or x_px is NaN, the
-    result is NaN and has confidence 0. The new confidence is a product. First factor: the share of the confidence in
-    the 5x5 that belongs to answers within 1 px of the median. Second factor: the probability that these answers are
-    right if each is independent evidence of it, odds = odds of NEUTRAL x product of (odds of the answer / odds of
-    NEUTRAL); if `coupled`, their mean confidence, since answers that influence each other are no such evidence. x_sd_px
-    becomes the standard deviation of a median of these answers.
+    result is NaN and has confidence 0.
+
+    The new confidence is a product. First factor: the share of the confidence in the 5x5 that belongs to answers within
+    1 px of the median. Second factor: the probability that these answers are right if each is independent evidence of
+    it, odds = odds of NEUTRAL x product of (odds of the answer / odds of NEUTRAL); if `coupled`, their mean confidence,
+    since answers that influence each other are no such evidence. x_sd_px becomes the standard deviation of a median of
+    these answers. Where there is none within 1 px, the confidence is 0 and x_sd_px the distance to the nearest.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

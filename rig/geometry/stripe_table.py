@@ -39,7 +39,8 @@ class StripeTable:
         return {name: value for name, value in values.items() if value is not None}
 
     def problem(self, rows: int, columns: int) -> str | None:
-        """The first array that is not float32 of shape (rows, columns), in words; None if all are."""
+        """What is wrong with the table of another package, in words: an array that is not float32 of shape (rows,
+        columns), or a confidence outside 0 to 1. None if nothing is."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         for name, value in values.items():
             if value is None and name in ("x2_px", "confidence2"):
@@ -47,6 +48,9 @@ class StripeTable:
             kind, shape = getattr(value, "dtype", type(value).__name__), getattr(value, "shape", ())
             if kind != np.float32 or shape != (rows, columns):
                 return f"{name} as {kind} {shape}, which must be float32 ({rows}, {columns})"
+        outside = ~((self.confidence >= 0) & (self.confidence <= 1))
+        if outside.any():
+            return f"a confidence of {float(self.confidence[outside][0]):g}, which must be from 0 to 1"
         return None
 
     @classmethod

@@ -109,11 +109,15 @@ class Study(BaseModel):
         known = KEYS[self.do]
         dotted = self.do in ("scan", "calibrate")
         problems = [
-            f"{self.do} has no setting {key!r}; it has {', '.join(known)}"
+            f"{key!r} is no setting but a key of the study itself, beside vary"
+            if key in Study.model_fields
+            else f"{self.do} has no setting {key!r}; it has {', '.join(known)}"
             + (", and keys of the config such as scan.columns" if dotted else "")
             for key in dict.fromkeys(given)
             if key not in known and not (dotted and key.count(".") == 1)
         ]
+        if self.do == "reconstruct" and self.repeat != 1:
+            problems.append("repeat is for what is drawn, and reconstruct draws nothing; leave it out")
         problems += [
             f"set gives {key} a list; set is for what all cases share, name the values under vary"
             for key, value in self.set.items()
@@ -202,12 +206,18 @@ def _anchored(key: str, value: Any, folder: Path) -> Any:
         return value
     path = folder / os.path.expanduser(value)
     name = key in NAMES and Path(value).name == value and not value.endswith((".yaml", ".yml"))
-    return value if name and not os.path.exists(path) else str(path)
+    # A folder may have the name of a config by chance: that of the results, for example. Some are scenes.
+    there = path.is_file() or (path / "world.npz").exists()
+    return value if name and not there else str(path)
 
 
 def _in_a_line(where: str, error: Mapping[str, Any]) -> str:
     key = ".".join(map(str, error["loc"])) or "its content"
     said = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "list_type":
+        return f"{where}: {key} is {error['input']!r}, not a list; write {key.rpartition('.')[2]}: [{error['input']}]"
+    if error["type"] == "extra_forbidden" and any(key in known for known in KEYS.values()):
+        return f"{where}: {key!r} is a setting; it belongs under vary (a list) or set (one value for all cases)"
     if error["type"] == "extra_forbidden":
         return f"{where}: {key!r} is no key of a study; its keys are {', '.join(Study.model_fields)}"
     return f"{where}: {key}: {said[:1].lower()}{said[1:]}"

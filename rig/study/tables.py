@@ -41,12 +41,12 @@ def lines_of(rows: Sequence[Row]) -> tuple[list[Line], list[str]]:
     lines: list[Line] = []
     labels = list(dict.fromkeys(key for row in rows for key in row.labels))
     for row in rows:
-        result, measured = dict(row.result), dict(row.measured)
+        result, measured, settings = dict(row.result), dict(row.measured), dict(_flat(row.labels))
         parts = result.pop("rows", [{}])
         for number, part in enumerate(parts):
             own = {key: value[number] for key, value in measured.items() if _is_of(value, parts)}
             figures = dict(_flat({**result, **part, **own}))
-            lines.append({**row.labels, **{key: figures[key] for key in figures if key not in row.labels}})
+            lines.append({**settings, **{key: figures[key] for key in figures if key not in settings}})
     if any("rows" in row.result for row in rows):  # what tells the rows of a case from each other is a setting too
         labels += [key for key in ("estimator", "filter", "strategy") if lines and key in lines[0]]
     return lines, list(dict.fromkeys(labels))

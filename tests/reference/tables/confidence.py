@@ -51,22 +51,28 @@ class _Seen(NamedTuple):
     """All, floating and right ones, before and after floating ones are left out (2, 3)."""
 
 
-def answers_of(scene: Scene, point: str, exposures: int, estimators: Sequence[str], seed: int) -> list[_Seen]:
-    """The answers of one map by each estimator, which see the same counts; and which of those taken float."""
+def answers_of(
+    scene: Scene, point: str, exposures: int, estimators: Sequence[str], filters: Sequence[str], seed: int
+) -> dict[str, _Seen]:
+    """The answers of one map by each estimator and filter, of the same counts; and which of those taken float."""
     height, width = scene.shape
     geometry = Geometry.build(width=width, height=height, **RIGS.get(point, {}))  # type: ignore[arg-type]
     world = WorkingPoint(scene, POINTS.get(point, REPORT), geometry)
     makers = [reconstructor_of(world, name) for name in estimators]
     window = makers[0].geometry
     counts = world.counts_in(window.x0, window.window, exposures, seed)
-    reference, seen = window.reference_px(), []
-    for maker in makers:
-        result = maker.map(volume_of(maker, counts, exposures))
-        x_px = np.where(result.stripe.confidence > TAKEN, result.stripe.x_px, np.nan)
-        floats = float(floating(x_px - reference, world.x_true - reference).sum() / np.isfinite(x_px).sum())
-        maps = depth_with_floating(maker, result), result.depth_m
-        points = np.array([_points(depth_m, scene.depth_m) for depth_m in maps])
-        seen.append(_Seen(Answers.of(world, result, slice(None)), floats, points))
+    reference, seen = window.reference_px(), {}
+    for estimator, maker in zip(estimators, makers, strict=True):
+        volume = volume_of(maker, counts, exposures)
+        stripe = maker.estimator.estimate(volume, maker.geometry)
+        for filter in filters:
+            result = maker.complete(stripe, volume, filter, 0.0)
+            x_px = np.where(result.stripe.confidence > TAKEN, result.stripe.x_px, np.nan)
+            floats = float(floating(x_px - reference, world.x_true - reference).sum() / np.isfinite(x_px).sum())
+            maps = depth_with_floating(maker, result), result.depth_m
+            points = np.array([_points(depth_m, scene.depth_m) for depth_m in maps])
+            name = estimator if filter == "none" else f"{estimator}, {filter}"
+            seen[name] = _Seen(Answers.of(world, result, slice(None)), floats, points)
     return seen
 
 
@@ -112,13 +118,15 @@ def cells_of(seen: Sequence[_Seen]) -> list[str]:
     ]  # fmt: skip
 
 
-def one_map(scene: str, point: str, exposures: int, estimators: Sequence[str], seed: int, keep: str) -> dict[str, Any]:
-    """What is seen in one map by each estimator as a case: the answers kept in files, the rest returned."""
-    seen = answers_of(scene_of(scene), point, exposures, estimators, seed)
+def one_map(
+    scene: str, point: str, exposures: int, estimators: Sequence[str], filters: Sequence[str], seed: int, keep: str
+) -> dict[str, Any]:
+    """What is seen in one map by each estimator and filter as a case: the answers kept in files, the rest returned."""
+    seen = answers_of(scene_of(scene), point, exposures, estimators, filters, seed)
     Path(keep).mkdir(parents=True)
-    for name, one in zip(estimators, seen, strict=True):
+    for name, one in seen.items():
         one.answers.save(Path(keep) / f"{name}.npz")
-    return {name: [one.floats, one.points.tolist()] for name, one in zip(estimators, seen, strict=True)}
+    return {name: [one.floats, one.points.tolist()] for name, one in seen.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         points="report-1,report-3,report-10,dense-3,dense-10,clear-1,clear-3,uneven-10,turned-10",
     )  # fmt: skip
     parser.add_argument("--estimators", default="likelihood,joint")
+    parser.add_argument("--filters", default="none")
     parser.add_argument("--seed", type=int, default=1)
     add_options(parser, workers=1)
     options = parser.parse_args(arguments)
@@ -137,14 +146,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for point, exposures in (asked.rsplit("-", 1) for asked in options.points.split(","))
         for scene in scenes
     ]
-    fixed = {"estimators": estimators, "seed": options.seed}
+    fixed = {"estimators": estimators, "filters": options.filters.split(","), "seed": options.seed}
     cases = [Case("tests.reference.tables.confidence:one_map", {**each, **fixed}, each, keeps=True) for each in maps]
     results = results_of(cases, options.workers, options.out, kept_answers)
     seen: dict[tuple[object, ...], list[_Seen]] = {}
     for each, result in zip(maps, results, strict=True):
-        for name in estimators if result is not None else ():
+        for name, answers in sorted((result or {"kept": {}})["kept"].items()):
             floats, points = result[name]
-            one = _Seen(result["kept"][name], np.nan if floats is None else floats, np.array(points))
+            one = _Seen(answers, np.nan if floats is None else floats, np.array(points))
             seen.setdefault((each["point"], each["exposures"], name), []).append(one)
     table = Table(TITLES)
     for line, of_scenes in seen.items():

@@ -51,14 +51,25 @@ def test_the_checksum_of_a_folder_sees_contents_and_names(tmp_path: Path) -> Non
     assert checksum(str(tmp_path / "c")) == seen[-1], "the place of the folder does not matter"
 
 
-def test_of_a_recording_the_index_is_read_and_frames_are_only_measured(tmp_path: Path) -> None:
-    (tmp_path / INDEX_FILE).write_text("checksums of all blocks")
-    (tmp_path / "frames.bin").write_text("0000")
-    before = checksum(str(tmp_path))
-    (tmp_path / "frames.bin").write_text("1111")
-    assert checksum(str(tmp_path)) == before
-    (tmp_path / "frames.bin").write_text("111")
-    assert checksum(str(tmp_path)) != before
+@pytest.mark.parametrize(
+    ("name", "before", "after", "counts"),
+    [
+        ("frames-000000.spb", "0000", "1111", False),
+        ("frames-000000.spb", "0000", "111", True),
+        ("calibration.yaml", "focal: 600", "focal: 900", True),
+        ("learned/000000.npz", "0000", "1111", True),
+        ("depth/000000.npy", "0000", "11", False),
+    ],
+)
+def test_of_a_recording_counts_what_a_replay_reads_and_frames_by_their_size(
+    tmp_path: Path, name: str, before: str, after: str, counts: bool
+) -> None:
+    (tmp_path / INDEX_FILE).write_text("where all blocks are")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(before)
+    one = checksum(str(tmp_path))
+    (tmp_path / name).write_text(after)
+    assert (checksum(str(tmp_path)) != one) == counts
 
 
 def test_a_changed_file_is_found_and_unchanged_ones_are_not_read_again(

@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -300,6 +302,68 @@ def test_quick_cases_are_sent_in_parcels_and_trouble_in_one_is_its_own(
     assert sum(parcels) == 302
     assert {each.kind for each in done.failures} == {"raised", "died"}
     assert done.done == 300
+
+
+def test_two_batches_of_the_same_cases_on_one_scheduler_keep_their_results_apart(tmp_path: Path, client: Any) -> None:
+    cases = [Case(f"{TINY}:square", {"x": x, "sleep_s": 0.05}, {"x": x}) for x in range(8)]
+    with ThreadPoolExecutor(2) as both:
+        done = list(both.map(lambda name: run(tmp_path / name, cases, client), ("one", "two")))
+    assert [(each.verdict, each.done) for each in done] == [("complete", 8)] * 2
+
+
+def test_slow_cases_behind_quick_ones_are_given_back_and_shared(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PARCEL_S", 0.2)
+    slow = [Case(f"{TINY}:square", {"x": x, "sleep_s": 0.3}, {"x": x}) for x in range(-8, 0)]
+    given: list[Ended] = []
+    judged = Cluster._judged
+
+    def noted(self: Cluster, ended: Ended) -> Ended:
+        given.append(ended)
+        return judged(self, ended)
+
+    monkeypatch.setattr(Cluster, "_judged", noted)
+    with Store(tmp_path / "out", [*squares(60), *slow]) as store:
+        executor = Cluster(store, client)
+        executor._case_s = 0.01
+        done = run_batch(store, executor)
+        workers = {row.measured["worker"] for row in store.rows() if row.labels["x"] < 0}
+    assert (done.verdict, done.done) == ("complete", 68)
+    assert "not begun" in {each.status for each in given}
+    assert len(workers) == 2
+
+
+def test_a_process_that_the_system_refuses_once_spoils_neither_thread_nor_parcel(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LOOK_S", 0.05)
+    refused = [OSError(24, "Too many open files")]
+
+    def popen(*given: Any, **options: Any) -> Any:
+        if refused:
+            raise refused.pop()
+        return really(*given, **options)
+
+    really = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    done = run(tmp_path / "out", squares(12), client, Limits(time_s=99.0))  # a pool of its own
+    assert refused == []
+    assert (done.verdict, done.done) == ("complete", 12)
+
+
+def test_an_input_that_is_changed_ends_the_batch_and_retires_nobody(tmp_path: Path, client: Any) -> None:
+    file = tmp_path / "input"
+    file.write_text("1")
+    cases = [replace(each, files=(str(file),)) for each in squares(12)]
+    before = client.nthreads()
+    with Store(tmp_path / "out", cases) as store:
+        executor = Cluster(store, client)
+        file.write_text("2")
+        done = run_batch(store, executor)
+    assert done.verdict == "stopped"
+    assert done.reason.startswith(f"{file} is not there any more as it was")
+    assert client.nthreads() == before
 
 
 def test_a_parcel_that_ends_twice_is_told_once(tmp_path: Path, client: Any) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -47,6 +48,13 @@ def test_each_trouble_fails_its_own_case_alone(tmp_path: Path) -> None:
     assert kinds["memory"].message.endswith("at most 0.21 GB")
     assert [len(list((tmp_path / kind).iterdir())) for kind in ("raise", "die", "hang", "eat")] == [1, 2, 2, 2]
     assert left_processes() == []
+
+
+def test_a_file_of_the_current_folder_is_no_module_of_a_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "queue.py").write_text("raise SystemExit('my own script')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[4]), *sys.path])
+    assert run(tmp_path / "out", squares(2), Limits()).verdict == "complete"
 
 
 def test_a_case_that_dies_once_is_done_by_another_process(tmp_path: Path) -> None:

@@ -4,13 +4,15 @@ import errno
 import json
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rig.batch import task as module
-from rig.batch.case import Case
+from rig.batch.case import Case, call
 from rig.batch.store import Store
 from rig.batch.task import Task, perform, read_result, result_file, write_once
 from tests.unit.rig.batch.executors import TINY, squares, troubles
@@ -95,14 +97,34 @@ def test_a_result_that_cannot_be_written_is_said_and_leaves_no_part(
     assert files(task) == []
 
 
-def test_a_case_that_keeps_files_begins_with_an_empty_folder(tmp_path: Path) -> None:
+def test_files_of_a_case_replace_those_of_an_attempt_without_a_result(tmp_path: Path) -> None:
     with Store(tmp_path / "out", [Case(f"{TINY}:keeping", {"x": 1}, keeps=True)]) as store:
         task = store.task(store.names[0])
         left = tmp_path / "out" / "files" / task.name
         left.mkdir(parents=True)
-        (left / "of an interrupted attempt").touch()
+        (left / "torn by a loss of power").touch()
         assert perform(task).status == "done"
+        (left.parent / f".{task.name}.1a2b.part").mkdir()
+        store.pack()
     assert [file.name for file in left.iterdir()] == ["map.txt"]
+    assert [folder.name for folder in left.parent.iterdir()] == [task.name], "nothing of a case that was killed"
+
+
+def test_a_case_begun_twice_keeps_its_files_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Store(tmp_path / "out", [Case(f"{TINY}:keeping", {"x": 1}, keeps=True)]) as store:
+        task = store.task(store.names[0])
+        start = threading.Barrier(6)
+
+        def together(function: str, inputs: Any) -> Any:
+            start.wait()
+            return call(function, inputs)
+
+        monkeypatch.setattr("rig.batch.task.call", together)
+        with ThreadPoolExecutor(6) as threads:
+            ended = list(threads.map(lambda number: perform(task, str(number)), range(6)))
+    assert {each.status for each in ended} == {"done"}
+    assert [file.name for file in (tmp_path / "out" / "files").iterdir()] == [task.name]
+    assert (tmp_path / "out" / "files" / task.name / "map.txt").read_text() == "1"
 
 
 def test_a_file_appears_whole_and_once_whoever_writes_it(tmp_path: Path) -> None:

@@ -62,6 +62,10 @@ def test_a_strangers_estimator_that_errs_is_named(monkeypatch):
 
     for wrong, told in (
         (replace(answer, haze=answer.haze[:5]), "haze as float32 (5, 96), which must be float32 (32, 96)"),
+        (
+            replace(answer, confidence=answer.confidence * np.float32(np.nan)),
+            "a confidence of nan, which must be from 0",
+        ),
         (replace(answer, x_px=answer.x_px.astype(float)), "x_px as float64 (32, 96)"),
         (replace(answer, signal=None), "signal as NoneType ()"),
     ):
@@ -72,6 +76,31 @@ def test_a_strangers_estimator_that_errs_is_named(monkeypatch):
     with pytest.raises(IndexError) as raised:
         maker.map(sweep.volume)
     assert raised.value.__notes__ == ["raised by the estimator their-own of another package: tell its authors"]
+
+
+@pytest.mark.parametrize(("estimator", "trusted"), [("likelihood", 1.0), ("joint", 0.5)])
+def test_the_filter_takes_agreement_for_evidence_unless_answers_influence_each_other(estimator, trusted):
+    sweep = simulated()
+    maker = reconstructor(sweep, estimator=estimator)
+    stripe = maker.estimator.estimate(sweep.volume, maker.geometry)
+    even = replace(stripe, x_px=maker.geometry.reference_px().astype(np.float32))
+    even.confidence[:] = 0.5
+    found = maker.complete(even, sweep.volume, "median", 0.0).stripe
+    assert np.nanmedian(found.confidence) == pytest.approx(trusted, abs=1e-3)
+
+
+def test_answers_without_light_stay_doubted_whatever_their_neighbours_are(monkeypatch):
+    sweep = simulated()
+    maker = reconstructor(sweep)
+    stripe = maker.estimator.estimate(sweep.volume, maker.geometry)
+    even = replace(stripe, x_px=maker.geometry.reference_px().astype(np.float32))
+    even.confidence[:] = 0.9
+    lowered = np.where(np.arange(even.confidence.shape[1]) < 30, np.float32(0.4), even.confidence)
+    monkeypatch.setattr(maker._checks, "check", lambda *given: (("dim",), replace(even, confidence=lowered)))
+    found = maker.complete(even, sweep.volume, "median", 0.0)
+    assert found.doubts == ("dim",)
+    assert found.stripe.confidence[:, :30].max() <= np.float32(0.4)
+    assert np.nanmedian(found.stripe.confidence[:, 40:]) > 0.99
 
 
 def test_depth_of_a_foggy_street_is_close_to_the_truth():

@@ -25,9 +25,27 @@ def reference_median(x, reference):
     return np.where(np.isnan(x), np.nan, result)
 
 
+def reference_trust(x, confidence, coupled):
+    """Confidence and standard deviation of each answer, from a list of its neighbours (reference 0)."""
+    trust, sd_px = np.zeros(x.shape), np.full(x.shape, np.nan)
+    for y, c in np.argwhere(np.isfinite(x)):
+        around = np.s_[max(0, y - 2) : y + 3, max(0, c - 2) : c + 3]
+        there = np.isfinite(x[around])
+        values, believed = x[around][there].astype(float), confidence[around][there].astype(float)
+        apart = np.abs(values - np.median(x[around][there]))
+        near, sd_px[y, c] = apart <= 1, apart.min()
+        share = believed[near].sum() / believed.sum() if believed.sum() else 0
+        if near.any():
+            right = np.mean(believed[near]) if coupled else together(np.clip(believed[near], 1e-6, 1 - 1e-6))
+            trust[y, c] = share * right
+            spread = np.mean((values[near] - np.median(values)) ** 2)
+            sd_px[y, c] = math.sqrt(math.pi / 2 * (spread + 1 / 12) / near.sum())
+    return trust, sd_px
+
+
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32), st.integers(1, 12), st.integers(1, 12), st.floats(0, 1))
-def test_the_filter_is_the_nan_aware_median_of_disparity(seed, rows, columns, missing):
+@given(st.integers(0, 2**32), st.integers(1, 12), st.integers(1, 12), st.floats(0, 1), st.booleans())
+def test_the_filter_is_the_nan_aware_median_of_disparity(seed, rows, columns, missing, coupled):
     rng = np.random.default_rng(seed)
     x = np.where(rng.random((rows, columns)) < missing, np.nan, rng.uniform(0, 500, (rows, columns)))
     reference = rng.uniform(-100, 600, (rows, columns))
@@ -35,6 +53,14 @@ def test_the_filter_is_the_nan_aware_median_of_disparity(seed, rows, columns, mi
     result = median_filter(table(x), reference).x_px
     assert result.dtype == np.float32
     np.testing.assert_allclose(result, reference_median(x, reference), atol=1e-3)
+    # Closer together, some answers just within a pixel of the median; some are believed not at all, some fully.
+    near = np.where(np.isnan(x), np.nan, rng.integers(0, 24, x.shape) / 8).astype(np.float32)
+    before = table(near)
+    before.confidence[:] = rng.choice([0, 0.05, 0.2, 0.4, 0.7, 0.95, 1], x.shape)
+    after = median_filter(before, np.zeros(x.shape), coupled=coupled)
+    trust, sd_px = reference_trust(near, before.confidence, coupled)
+    np.testing.assert_allclose(after.confidence, trust, atol=1e-4)
+    np.testing.assert_allclose(after.x_sd_px, sd_px, rtol=1e-3)
 
 
 def test_light_stays_and_confidence_is_the_agreement_of_the_neighbours():

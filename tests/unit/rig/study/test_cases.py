@@ -53,7 +53,7 @@ def test_a_reconstruction_has_no_seed_and_reads_its_recording(tmp_path: Path) ->
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "manifest.json").write_text("{}")
     recording = str(tmp_path / "run")
-    made = cases(do="reconstruct", set={"recording": recording}, vary={"estimator": ["edge", "joint"]}, repeat=3)
+    made = cases(do="reconstruct", set={"recording": recording}, vary={"estimator": ["edge", "joint"]})
     assert [each.labels for each in made] == [{"estimator": "edge"}, {"estimator": "joint"}]
     assert made[0].inputs == {"recording": recording, "estimator": "edge"}
     assert made[0].files == (recording,)

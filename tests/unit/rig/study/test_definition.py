@@ -24,7 +24,13 @@ def problems_of(content: dict[str, Any]) -> list[str]:
         ({"do": "paint"}, "study: do: input should be 'scan', 'reconstruct', 'tradeoff', 'strategies' or 'calibrate'"),
         ({"do": "scan", "vari": {}}, "study: 'vari' is no key of a study; its keys are do, vary, also, set, omit,"),
         ({"do": "scan", "vary": {"maps": []}}, "study: vary.maps: list should have at least 1 item"),
-        ({"do": "scan", "vary": {"maps": 3}}, "study: vary.maps: input should be a valid list"),
+        ({"do": "scan", "vary": {"maps": 3}}, "study: vary.maps is 3, not a list; write maps: [3]"),
+        (
+            {"do": "scan", "vary": {"seed": [3]}},
+            "study: 'seed' is no setting but a key of the study itself, beside vary",
+        ),
+        ({"do": "scan", "config": "small"}, "study: 'config' is a setting; it belongs under vary (a list) or set"),
+        ({"do": "reconstruct", "repeat": 3}, "study: repeat is for what is drawn, and reconstruct draws nothing"),
         (
             {"do": "scan", "set": {"estimator": ["edge", "joint"]}},
             "set gives estimator a list; set is for what all cases",
