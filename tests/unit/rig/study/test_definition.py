@@ -123,6 +123,7 @@ def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path) -> 
     (tmp_path / "rigs").mkdir()
     (tmp_path / "rigs" / "mine.yaml").touch()
     (tmp_path / "dust.yaml").touch()
+    (tmp_path / "street").mkdir()  # the results of a study that somebody called so
     content = {
         "do": "scan",
         "set": {"config": "rigs/mine.yaml"},

@@ -25,6 +25,8 @@ def row(labels: dict[str, Any], result: dict[str, Any], measured: dict[str, Any]
 
 
 def test_a_line_has_settings_figures_and_nested_figures() -> None:
+    (line,), labels = lines_of([row({"scan.depth_range": ["1 m", "8 m"]}, {"error": 0.5})])
+    assert (line, labels) == ({"scan.depth_range": "1 m; 8 m", "error": 0.5}, ["scan.depth_range"])
     lines, labels = lines_of([row({"fog": "20m", "seed": 1}, {"error": 0.5, "fog": "x", "of": {"a": 1, "b": [1, 2]}})])
     assert lines == [{"fog": "20m", "seed": 1, "error": 0.5, "of.a": 1, "of.b": "1; 2"}]
     assert labels == ["fog", "seed"]
