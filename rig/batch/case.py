@@ -121,8 +121,8 @@ def checksum(path: str) -> str:
 _FEW: Final = MANIFEST, INDEX_FILE, "*.yaml", "*.npz"
 _FRAMES: Final = "frames-*"
 _READ: Final = *_FEW, _FRAMES, "learned/*", "truth/*"
-"""What a replay reads of a recording: plan, calibration and first learned state, frames, and what was kept for each
-map. `_FEW` are those of which there are few."""
+"""Files of a recording that a replay reads: plan, calibration and first learned state, frames, and those kept for each
+map. There are few of `_FEW`."""
 _known: dict[str, tuple[list[tuple[str, int, int]], str]] = {}
 """Checksums that were computed, with names, sizes and times of the files then."""
 

@@ -220,7 +220,7 @@ class Cluster:
         return Ended(ended.name, "lost", note)
 
     def _changed(self, status: Status) -> bool:
-        """Whether what a worker has found is so here too."""
+        """Whether a fault that a worker has found is here too."""
         if status == "other files":
             return changed_file(self._files) is not None
         fresh = code_digest.__wrapped__  # without its cache

@@ -210,7 +210,7 @@ class _Runs:
             yield
 
     def tries(self, name: str) -> int:
-        """How often a case was tried, or else lost."""
+        """Number of times that a case was tried, or else lost."""
         return self.attempts[name] or self._lost[name]
 
     def _end(self, ended: Ended) -> None:

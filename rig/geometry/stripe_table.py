@@ -39,8 +39,8 @@ class StripeTable:
         return {name: value for name, value in values.items() if value is not None}
 
     def problem(self, rows: int, columns: int) -> str | None:
-        """What is wrong with the table of another package, in words: an array that is not float32 of shape (rows,
-        columns), or a confidence outside 0 to 1. None if nothing is."""
+        """A fault of the table of another package, in words: an array that is not float32 of shape (rows,
+        columns), or a confidence outside 0 to 1. None if there is none."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         for name, value in values.items():
             if value is None and name in ("x2_px", "confidence2"):
