@@ -183,12 +183,12 @@ class Cluster:
             told = self._client.gather([f for f, _ in mine if f.status == "finished"], errors="skip")
         except (OSError, TimeoutError):
             told = []
-        found = {each.name: each for parcel in told for each in parcel}
+        found = {each.name: each for parcel, _ in told for each in parcel}
         ended = [self._judged(found.get(name) or _lost(name, future)) for future, names in mine for name in names]
         self._under_way -= len(ended)
-        for each in ended:
-            if each.seconds:  # 0 if it was done already, or not begun
-                self._case_s += NEWEST_SHARE * (min(each.seconds, PARCEL_S) - self._case_s)
+        for parcel, case_s in told:
+            begun = sum(each.status != "not begun" for each in parcel)
+            self._case_s += (1 - (1 - NEWEST_SHARE) ** begun) * (min(case_s, PARCEL_S) - self._case_s)
         return ended
 
     def close(self) -> None:
@@ -337,21 +337,24 @@ def _batch_system(file: Path) -> tuple[Any, int]:
     return made, jobs
 
 
-def _do(parcel: Sequence[Task], limits: Limits) -> list[Ended]:
-    """Do the tasks of a parcel on a worker, one after the other, as long as PARCEL_S allows to begin one."""
-    ends_s = time.monotonic() + PARCEL_S
+def _do(parcel: Sequence[Task], limits: Limits) -> tuple[list[Ended], float]:
+    """Do the tasks of a parcel on a worker, one after the other, as long as PARCEL_S allows to begin one.
+
+    Also returns the wall time that each took, in seconds, with all that is done around it.
+    """
+    begun_s = time.monotonic()
     done: list[Ended] = []
     for task in parcel:
-        if done and (time.monotonic() > ends_s or done[-1].status in UNFIT):
-            done.append(Ended(task.name, "not begun"))
-            continue
+        if done and (time.monotonic() - begun_s > PARCEL_S or done[-1].status in UNFIT):
+            break
         try:
             done.append(_on_worker(task, limits))
         except Exception as error:  # too many open files, no room for another process: the next may succeed
             _close_pool()
             time.sleep(LOOK_S)  # others take cases meanwhile
             done.append(Ended(task.name, "lost", f"its worker could not begin it: {error or type(error).__name__}"))
-    return done
+    case_s = (time.monotonic() - begun_s) / len(done)
+    return [*done, *(Ended(task.name, "not begun") for task in parcel[len(done) :])], case_s
 
 
 def _on_worker(task: Task, limits: Limits) -> Ended:
