@@ -40,6 +40,8 @@ SIZES: Final = {"MB": 1e6, "GB": 1e9}
 TIMES_S: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _AMOUNT: Final = re.compile(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", re.ASCII)
 MOST_CASES: Final = 1_000_000
+MOST_SHOWN: Final = 60
+"""Most characters of a value that an error repeats."""
 
 
 class Study(BaseModel):
@@ -207,7 +209,7 @@ def _anchored(key: str, value: Any, folder: Path) -> Any:
     path = folder / os.path.expanduser(value)
     name = key in NAMES and Path(value).name == value and not value.endswith((".yaml", ".yml"))
     # A folder may have the name of a config by chance: that of the results, for example. Some are scenes.
-    there = path.is_file() or (path / "world.npz").exists()
+    there = os.path.isfile(path) or os.path.exists(path / "world.npz")
     return value if name and not there else str(path)
 
 
@@ -215,7 +217,9 @@ def _in_a_line(where: str, error: Mapping[str, Any]) -> str:
     key = ".".join(map(str, error["loc"])) or "its content"
     said = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "list_type":
-        return f"{where}: {key} is {error['input']!r}, not a list; write {key.rpartition('.')[2]}: [{error['input']}]"
+        given = str(error["input"]) if isinstance(error["input"], str | int | float) else ""
+        shown = given if given.isprintable() and len(given) <= MOST_SHOWN else ""
+        return f"{where}: {key} is {shown or 'something else'}, not a list; write {key.rpartition('.')[2]}: [{shown or '...'}]"
     if error["type"] == "extra_forbidden" and any(key in known for known in KEYS.values()):
         return f"{where}: {key!r} is a setting; it belongs under vary (a list) or set (one value for all cases)"
     if error["type"] == "extra_forbidden":
