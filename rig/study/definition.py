@@ -219,7 +219,8 @@ def _in_a_line(where: str, error: Mapping[str, Any]) -> str:
     if error["type"] == "list_type":
         given = str(error["input"]) if isinstance(error["input"], str | int | float) else ""
         shown = given if given.isprintable() and len(given) <= MOST_SHOWN else ""
-        return f"{where}: {key} is {shown or 'something else'}, not a list; write {key.rpartition('.')[2]}: [{shown or '...'}]"
+        name = key.rpartition(".")[2]
+        return f"{where}: {key} is {shown or 'something else'}, not a list; write {name}: [{shown or '...'}]"
     if error["type"] == "extra_forbidden" and any(key in known for known in KEYS.values()):
         return f"{where}: {key!r} is a setting; it belongs under vary (a list) or set (one value for all cases)"
     if error["type"] == "extra_forbidden":
