@@ -79,7 +79,7 @@ class Cluster:
         close: Callable[[], object] | None = None,
         looked: Callable[[], object] | None = None,
     ) -> None:
-        self._client = client
+        self._store, self._client = store, client
         self._close, self._looked = close, looked
         self._limits = limits or Limits()
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
@@ -89,7 +89,6 @@ class Cluster:
         self._case_s = PARCEL_S
         # Other batches on the same scheduler may have the same cases, and it does each key once.
         self._keys = (f"parcel-{secrets.token_hex(8)}-{number}" for number in count())
-        self._codes, self._files = dict(store.codes), dict(store.checksums)
         self._threads = 0
         self._looked_s = float("-inf")
         self._with_workers_s = time.monotonic()
@@ -222,9 +221,9 @@ class Cluster:
     def _changed(self, status: Status) -> bool:
         """Whether a fault that a worker has found is here too."""
         if status == "other files":
-            return changed_file(self._files) is not None
+            return changed_file(self._store.checksums) is not None
         fresh = code_digest.__wrapped__  # without its cache
-        return status == "other code" and any(fresh(package) != code for package, code in self._codes.items())
+        return status == "other code" and any(fresh(package) != code for package, code in self._store.codes.items())
 
 
 def connect(cluster: str, store: Store, limits: Limits) -> Cluster:

@@ -150,7 +150,7 @@ def result_file(folder: Path, name: str) -> Path:
 def write_once(file: Path, text: str) -> None:
     """Write a file that appears whole, unless it is there already. Raises OSError."""
     file.parent.mkdir(exist_ok=True)
-    scratch = file.with_name(f".{file.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    scratch = file.with_name(f".{file.name}.{os.getpid()}.{secrets.token_hex(4)}{SCRATCH}")
     try:
         scratch.write_text(text, encoding="utf-8")
         try:

@@ -209,13 +209,14 @@ class Reconstructor:
         fog, intensity = self._fog(sweep, stripe, used), sweep.intensity(workers)
         doubts, checked = self._checks.check(sweep, intensity, stripe)
         doubts = (*sweep.doubts, *doubts)
-        doubted, stripe = checked.confidence < stripe.confidence, checked
         if filter == "median":
             from rig.estimate.median import median_filter
 
-            stripe = median_filter(checked, geometry.reference_px(), coupled=self._coupled)
-            most = np.where(doubted, checked.confidence, np.float32(1))  # neighbours are no reason to believe it again
-            stripe = replace(stripe, confidence=np.minimum(stripe.confidence, most))
+            filtered = median_filter(checked, geometry.reference_px(), coupled=self._coupled)
+            # What the checks doubt is not to be believed again because of its neighbours.
+            most = np.where(checked.confidence < stripe.confidence, checked.confidence, np.float32(1))
+            checked = replace(filtered, confidence=np.minimum(filtered.confidence, most))
+        stripe = checked
         if self._lines is not None:  # after the filter, which makes answers surer
             stripe = share_claims(stripe, self._lines)
         floating: int | None = None

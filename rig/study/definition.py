@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from calibration.errors import FileError
+from calibration.files.problems import MAX_VALUE_CHARACTERS
 from calibration.files.sections import load_yaml
 from rig.config.overrides import MAX_SEED, PathLike
 from rig.errors import UsageError
@@ -40,8 +41,6 @@ SIZES: Final = {"MB": 1e6, "GB": 1e9}
 TIMES_S: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _AMOUNT: Final = re.compile(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", re.ASCII)
 MOST_CASES: Final = 1_000_000
-MOST_SHOWN: Final = 60
-"""Most characters of a value that an error repeats."""
 
 
 class Study(BaseModel):
@@ -218,7 +217,7 @@ def _in_a_line(where: str, error: Mapping[str, Any]) -> str:
     said = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "list_type":
         given = str(error["input"]) if isinstance(error["input"], str | int | float) else ""
-        shown = given if given.isprintable() and len(given) <= MOST_SHOWN else ""
+        shown = given if given.isprintable() and len(given) <= MAX_VALUE_CHARACTERS else ""
         name = key.rpartition(".")[2]
         return f"{where}: {key} is {shown or 'something else'}, not a list; write {name}: [{shown or '...'}]"
     if error["type"] == "extra_forbidden" and any(key in known for known in KEYS.values()):

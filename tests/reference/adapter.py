@@ -25,10 +25,15 @@ def reconstruct(
     """The project's MapResult of one map of counts (columns, H, W) with each filter, estimated once."""
     maker = reconstructor_of(point, estimator, threads=threads)
     volume = volume_of(maker, windowed(counts, maker.geometry.x0, maker.geometry.window), exposures)
+    return filtered_maps(maker, volume, filters)
+
+
+def filtered_maps(reconstructor: Any, volume: Any, filters: Sequence[str]) -> list[Any]:
+    """The MapResult of a volume with each filter, estimated once."""
     begun = time.perf_counter()
-    stripe = maker.estimator.estimate(volume, maker.geometry)
+    stripe = reconstructor.estimator.estimate(volume, reconstructor.geometry)
     estimate_s = time.perf_counter() - begun
-    return [maker.complete(stripe, volume, filter, estimate_s) for filter in filters]
+    return [reconstructor.complete(stripe, volume, filter, estimate_s) for filter in filters]
 
 
 def reconstructor_of(

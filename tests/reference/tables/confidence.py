@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from rig.batch.case import Case
 from tests.campaigns.studies import add_options, results_of
-from tests.reference.adapter import depth_with_floating, reconstructor_of, volume_of
+from tests.reference.adapter import depth_with_floating, filtered_maps, reconstructor_of, volume_of
 from tests.reference.geometry import BASELINE_M, FOCAL_PX, Geometry
 from tests.reference.scene import Scene
 from tests.reference.tables.accuracy import RIGS
@@ -63,10 +63,8 @@ def answers_of(
     counts = world.counts_in(window.x0, window.window, exposures, seed)
     reference, seen = window.reference_px(), {}
     for estimator, maker in zip(estimators, makers, strict=True):
-        volume = volume_of(maker, counts, exposures)
-        stripe = maker.estimator.estimate(volume, maker.geometry)
-        for filter in filters:
-            result = maker.complete(stripe, volume, filter, 0.0)
+        results = filtered_maps(maker, volume_of(maker, counts, exposures), filters)
+        for filter, result in zip(filters, results, strict=True):
             x_px = np.where(result.stripe.confidence > TAKEN, result.stripe.x_px, np.nan)
             floats = float(floating(x_px - reference, world.x_true - reference).sum() / np.isfinite(x_px).sum())
             maps = depth_with_floating(maker, result), result.depth_m
