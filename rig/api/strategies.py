@@ -16,7 +16,6 @@ from rig.requests import StrategiesRequest, TradeoffRequest
 from rig.run_folder.folder import RunFolder
 from rig.strategies.apparatus import Rule
 from rig.strategies.comparison.compare import (
-    LINES,
     Comparison,
     ComparisonPlan,
     cases_of,
@@ -25,6 +24,7 @@ from rig.strategies.comparison.compare import (
 )
 from rig.strategies.comparison.files import write_files
 from rig.strategies.comparison.places import OWN, air_problems
+from rig.strategies.comparison.scene import LINES
 from rig.strategies.strategy import Strategy, find_strategy, strategy_names
 
 ALL: Final = "all"

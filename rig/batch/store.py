@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
-from rig.batch.case import MEASURED, Case, checksum, code_digest, numeric_versions, package_of
+from rig.batch.case import MEASURED, Case, Result, checksum, code_digest, numeric_versions, package_of
 from rig.batch.task import CASE, CASES, FILES, HEAD, RESULT, SCRATCH, Task, read_result
 from rig.errors import UsageError
 from rig.run_folder.disk import hold, replace_file, sync_folder
@@ -181,6 +181,11 @@ class Store:
     def rows(self) -> Iterator[Row]:
         """All finished cases, in order."""
         return read_rows(self.folder)
+
+    def results(self) -> list[Result | None]:
+        """What the given cases have returned, in their order; None for those that are not finished."""
+        found = {row.case: {**row.result, MEASURED: row.measured} for row in self.rows()}
+        return [found.get(name) for name in self.names]
 
     def pack(self) -> set[str]:
         """Write the table with all results that there are, and return the names of their cases. Raises OSError."""

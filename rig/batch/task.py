@@ -81,8 +81,11 @@ class Ended:
     worker: str = ""
 
 
-def perform(task: Task, worker: str = "") -> Ended:
-    """Do a task whose result is not there yet, and write it. worker: its name, for the record."""
+def perform(task: Task, worker: str = "", *, raises: bool = False) -> Ended:
+    """Do a task whose result is not there yet, and write it.
+
+    worker: its name, for the record. raises: whether an error of the case is raised, and not the end of the task.
+    """
     folder = Path(task.folder)
     if not (folder / HEAD).exists():
         return Ended(task.name, "no folder", f"{folder} is not there; share it under the same path", worker=worker)
@@ -108,8 +111,12 @@ def perform(task: Task, worker: str = "") -> Ended:
         measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
         line = json_line({CASE: task.name, RESULT: result, MEASURED: measured})
     except MemoryError:
+        if raises:
+            raise
         return Ended(task.name, "memory", "the case ran out of memory", traceback.format_exc(), worker=worker)
     except Exception as error:
+        if raises:
+            raise
         said = " ".join(str(error).split()) or "no message"
         message = f"{type(error).__name__}: {said}"
         # A full disk is no fault of the case: all others that write files would fail as well.

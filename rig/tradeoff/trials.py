@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from rig.batch.case import Case, Result, files_of
+from rig.batch.here import do_here
 from rig.config.estimators import estimator_names
 from rig.config.files import portable_content
 from rig.config.models import AUTO, RigConfig
 from rig.config.overrides import Config, configure, with_lines
 from rig.errors import each_or_problems
 from rig.estimate.registry import FILTERS
-from rig.progress import Progress, part, tell_stage
+from rig.progress import Progress, tell_stage
 from rig.requests import TradeoffRequest
 from rig.tradeoff.choice import Choice, Wish, advice, choose
 from rig.tradeoff.limits import SceneLimits
@@ -172,20 +173,11 @@ def run_tradeoff(
 
     An interrupt ends the trade-off after the last complete trial; before the first complete one it is raised again.
     """
-    cases = cases_of(trials, asked)
-    found: list[Result | None] = []
-    verdict: Literal["complete", "aborted"] = "complete"
-    try:
-        for case in cases:
-            with part(f"scan {len(found) + 1} of {len(cases)}"):
-                found.append(case.call())
-            if progress is not None:
-                progress(len(found), len(cases))
-    except KeyboardInterrupt:
-        if len(found) < asked.repeat:
-            raise
-        verdict = "aborted"
-    return tabulate(trials, asked, wish, found + [None] * (len(cases) - len(found)), verdict)
+    found, aborted = do_here(cases_of(trials, asked), "scan", progress)
+    done = tabulate(trials, asked, wish, found, "aborted" if aborted else "complete")
+    if not done.rows:
+        raise KeyboardInterrupt
+    return done
 
 
 def method_problems(estimators: Sequence[str], filters: Sequence[str]) -> list[str]:

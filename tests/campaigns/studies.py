@@ -45,11 +45,11 @@ def results_of(
             print(f"{dict(failure.labels)} failed: {failure.kind}, {failure.message}\n{failure.detail}", flush=True)
         if done.verdict == "aborted":
             raise KeyboardInterrupt
-        found = {row.case: {**row.result, "measured": row.measured} for row in store.rows()}
-        if read is not None:
-            for name, result in found.items():
+        found = [None if result is None else dict(result) for result in store.results()]
+        for name, result in zip(store.names, found, strict=True):
+            if read is not None and result is not None:
                 result["kept"] = read(store.folder / FILES / name)
-        return [found.get(name) for name in store.names]
+        return found
 
 
 def _put_back(before: str | None) -> None:

@@ -220,12 +220,10 @@ def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
     if rows:
         replace_file(store.folder / "table.csv", csv_of(lines_of(rows)[0]).encode())
     if made.write is not None and rows:
-        results = {row.case: {**row.result, "measured": row.measured} for row in rows}
-        found: list[Result | None] = [results.get(name) for name in store.names]
         place = store.folder / made.name
         shutil.rmtree(place, ignore_errors=True)
         with RunFolder(place) as folder:
-            made.write(folder, found, aborted)
+            made.write(folder, store.results(), aborted)
     replace_file(store.folder / "report.html", study_report(store.folder).encode())
 
 

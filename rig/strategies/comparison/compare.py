@@ -8,34 +8,28 @@ table is one strategy in one scene and air, with one rule and time.
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from calibration.model.rig_model import RigModel
-from drivers.errors import DeviceError
 from rig.batch.case import Case, Result, files_of
+from rig.batch.here import do_here
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
-from rig.config.overrides import configure
-from rig.errors import RigError, UsageError
-from rig.plan.scan_plan import column_command
-from rig.progress import part, tell_stage
+from rig.errors import RigError
+from rig.progress import tell_stage
 from rig.simd import Float32, Float64
-from rig.strategies.apparatus import Apparatus, Budget, MakesApparatus, Rule, Spent
+from rig.strategies.apparatus import Budget, Rule, Spent
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
-from rig.strategies.comparison.places import OWN, rig_model, scene_file, visibility_m
-from rig.strategies.comparison.score import Score, score, scored_pixels
+from rig.strategies.comparison.places import OWN, visibility_m
+from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
+from rig.strategies.comparison.score import Score, score
 from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort, find_strategy
-from rig.tradeoff.effects import open_world
 
-LINES: Final = 8
-"""The number of columns is a multiple of this, so that as many lines can share them."""
 OVERSPENT: Final = 1e-6
 """Share by which a measurement may exceed its time, because of rounding."""
 REACHED: Final = 0.9
@@ -66,30 +60,6 @@ class ComparisonPlan:
     airs: Sequence[str | None]
     times_s: Sequence[float]
     rules: Sequence[Rule]
-    rows: int
-    lux: float | None
-    seeds: range
-
-    def parts(self) -> list["ComparisonPart"]:
-        """The parts that are measured independently, in the table's order."""
-        return [
-            ComparisonPart(name, scene, air, rule, time_s, self.rows, self.lux, self.seeds)
-            for (name, scene), air, rule, time_s in product(self.scenes.items(), self.airs, self.rules, self.times_s)
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class ComparisonPart:
-    """A part of a comparison: all strategies in one scene and air, by one rule and in one time.
-
-    name: of the scene in the table. The other fields are as in `ComparisonPlan`.
-    """
-
-    name: str
-    scene: str
-    air: str | None
-    rule: Rule
-    time_s: float
     rows: int
     lux: float | None
     seeds: range
@@ -170,153 +140,105 @@ def run_comparison(
     asked: ComparisonPlan,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Measure with all strategies and tabulate. progress: called with the number of measurements done and the total.
+    """Measure with all strategies in this process and tabulate.
+
+    progress: called with the number of measurements done and the total.
 
     Raises UsageError if a scene cannot be used, and RigError if a strategy takes more time than it has. After an
     interrupt the complete rows are returned; if there is none, the interrupt is raised again.
     """
-    rows: list[StrategyRow] = []
-    verdict: Literal["complete", "aborted"] = "complete"
-    parts = asked.parts()
     try:
-        for one in parts:
-            for row in _rows(config, ways, one):
-                rows.append(row)
-                if progress is not None:
-                    progress(len(rows), len(ways) * len(parts))
-    except KeyboardInterrupt:
-        if not rows:
-            raise
-        verdict = "aborted"
-    return _comparison(ways, rows, verdict)
+        found, aborted = do_here(cases_of(config, ways, asked), "measurement", progress)
+    finally:
+        close_scene()
+    done = tabulate(ways, found, "aborted" if aborted else "complete")
+    if not done.rows:
+        raise KeyboardInterrupt
+    return done
 
 
 def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan) -> list[Case]:
-    """A case for each part, with all strategies."""
-    content, names = portable_content(config), [way.name for way in ways]
+    """A case for each row, in the table's order."""
+    content = portable_content(config)
     cases = []
-    for one in asked.parts():
-        file = str(Path(one.scene).absolute()) if Path(one.scene).exists() else one.scene
-        plain = {**asdict(one), "scene": file, "seeds": [one.seeds.start, one.seeds.stop]}
-        fog = OWN if one.air is None else one.air
-        labels = {"scene": one.scene, "fog": fog, "rule": one.rule, "time": one.time_s}
-        inputs = {"config": content, "ways": names, "one": plain}
-        cases.append(Case(f"{__name__}:measure_once", inputs, labels, files_of(content, file)))
+    for (name, scene), air in product(asked.scenes.items(), asked.airs):
+        file = str(Path(scene).absolute()) if Path(scene).exists() else scene
+        place = asdict(Place(name, file, air, asked.rows, asked.lux))
+        files = files_of(content, file)
+        for rule, time_s, way in product(asked.rules, asked.times_s, ways):
+            labels = {
+                "scene": scene, "fog": OWN if air is None else air, "rule": rule, "time": time_s, "strategy": way.name
+            }  # fmt: skip
+            inputs = {"config": content, "place": place, "way": way.name, "rule": rule, "time_s": time_s,
+                      "seeds": [asked.seeds.start, asked.seeds.stop]}  # fmt: skip
+            cases.append(Case(f"{__name__}:measure_once", inputs, labels, files))
     return cases
 
 
-def measure_once(config: Mapping[str, Any], ways: Sequence[str], one: Mapping[str, Any]) -> dict[str, Any]:
-    """The rows of a part of a comparison as a case: plain values, with the computing times apart."""
-    made = ComparisonPart(**{**one, "seeds": range(*one["seeds"])})
-    rows = list(_rows(RigConfig.model_validate(config), [find_strategy(name) for name in ways], made))
-    return {
-        "rows": [{key: value for key, value in asdict(row).items() if key != "compute_s"} for row in rows],
-        "measured": {"compute_s": [row.compute_s for row in rows]},
-    }
+def measure_once(
+    config: Mapping[str, Any], place: Mapping[str, Any], way: str, rule: Rule, time_s: float, seeds: tuple[int, int]
+) -> dict[str, Any]:
+    """One row of a comparison as a case: plain values, with the computing time apart."""
+    row = _measured(open_scene(config, Place(**place)), find_strategy(way), rule, time_s, range(*seeds))
+    content = asdict(row)
+    compute_s = content.pop("compute_s")
+    return {"rows": [content], "measured": {"compute_s": [compute_s]}}
 
 
 def tabulate(
     ways: Sequence[Strategy], found: Sequence[Result | None], verdict: Literal["complete", "aborted"] = "complete"
 ) -> Comparison:
     """Make the comparison of the results of `cases_of`; those that are missing are left out."""
-    rows = [
+    rows = tuple(
         StrategyRow(**{**row, "compute_s": compute_s})
         for result in found
         if result is not None
         for row, compute_s in zip(result["rows"], result["measured"]["compute_s"], strict=True)
-    ]
-    return _comparison(ways, rows, verdict)
-
-
-def _comparison(
-    ways: Sequence[Strategy], rows: Sequence[StrategyRow], verdict: Literal["complete", "aborted"]
-) -> Comparison:
+    )
     notes = tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
-    return Comparison(tuple(rows), {way.name: way.sentence for way in ways}, notes, verdict)
+    return Comparison(rows, {way.name: way.sentence for way in ways}, notes, verdict)
 
 
-def _rows(config: RigConfig, ways: Sequence[Strategy], one: ComparisonPart) -> Iterator[StrategyRow]:
-    """The rows of a part of a comparison."""
-    with part(one.name if one.air is None else f"{one.name}, {one.air}"), TemporaryDirectory() as made:
-        tell_stage("making the scene")
-        model = rig_model(config)
-        file = scene_file(one.scene, one.air, one.lux, model, Path(made))
-        yield from _in_scene(configure(config, scene=str(file)), model, ways, one)
+def _measured(scene: OpenScene, way: Strategy, rule: Rule, time_s: float, seeds: range) -> StrategyRow:
+    """The row of a strategy before a scene."""
+    place = scene.place
+    within = "the scene's own air" if place.air is None else place.air
+    tell_stage(f"{way.name}, {place.name}, {within}, {time_s * 1e3:g} ms")
+    row = StrategyRow(way.name, way.light, place.name, place.air, rule, 1e3 * time_s, len(scene.true_m))
+    classes = _classes(scene.config, scene.geometry, way.light, scene.power_w, rule, time_s)
+    row = replace(row, laser_class=classes[0], laser_class_still=classes[1])
+    begun = time.perf_counter()
+    scores: list[Score] = []
+    reached = Reached(scene.true_m)
+    spent: list[tuple[float, float]] = []
+    try:
+        for seed in seeds:
+            answer, used = _measure(scene, way, rule, time_s, seed)
+            spent.append((used.time_s, used.energy_j))
+            scores.append(score(answer, scene.truth, scene.geometry, scene.scored))
+            reached.add(answer.depth_m[scene.scored])
+    except TooShort as why:
+        return replace(row, too_short=str(why), compute_s=time.perf_counter() - begun)
+    spent_ms, energy_mj = (1e3 * statistics.fmean(each) for each in zip(*spent, strict=True))
+    row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=spent_ms, energy_mj=energy_mj)
+    return replace(row, compute_s=time.perf_counter() - begun)
 
 
-def _in_scene(
-    config: RigConfig, model: RigModel, ways: Sequence[Strategy], one: ComparisonPart
-) -> Iterator[StrategyRow]:
-    """The rows of a part of a comparison, whose scene and air are those of the config."""
-    rule, time_s, scan = one.rule, one.time_s, config.scan
-    columns = scan.columns // LINES * LINES
-    commands = np.array([column_command(column, scan.command_range, columns) for column in range(columns)])
-    height = model.camera.height
-    measured = min(one.rows, height)
-    rows = np.arange(measured) + (height - measured) // 2
-    geometry = ColumnGeometry(model, commands, scan.depth_range, rows)
-    frame_s = float(1 / scan.frame_rate)
-    with open_world(config) as (world, power_w):
-        opened: Any = world
-        if not isinstance(opened, MakesApparatus):
-            raise UsageError("this world cannot be measured in other ways than with a scanned line")
-        truth = world.truth(commands)
-        scored = scored_pixels(truth, geometry)
-        true_m = truth.depth_m[rows][scored]
-        if not scored.any():
-            raise UsageError(f"scene {one.name}: the source lights nothing that the camera sees; check the scene")
-
-        def apparatus_of(seed: int) -> Apparatus:
-            try:
-                made: Apparatus = opened.apparatus(
-                    rows=rows, columns=columns, command_range=scan.command_range, power_w=power_w, rule=rule, seed=seed,
-                    depth_range_m=scan.depth_range, spad_frame_s=frame_s,
-                )  # fmt: skip
-            except DeviceError as error:
-                raise UsageError(f"scene {one.name}: {error}") from error
-            except ValueError as error:  # the config asks for what no apparatus has
-                raise UsageError(f"{config.name}: {error}") from error
-            return made
-
-        def measure(way: Strategy, seed: int) -> tuple[Answer, Spent]:
-            apparatus = apparatus_of(seed)
-            try:
-                answer = way.measure(apparatus, geometry, Budget(time_s), seed)
-            except (TooShort, RigError):
-                raise
-            except Exception as error:
-                error.add_note(f"raised by the strategy {way.name} in {time_s * 1e3:g} ms: tell its authors")
-                raise
-            require_form(answer, way.name, geometry.shape)
-            spent = apparatus.spent
-            if spent.time_s > time_s * (1 + OVERSPENT):
-                raise RigError(
-                    f"{way.name} took {spent.time_s * 1e3:g} ms of {time_s * 1e3:g} ms; correct the strategy"
-                )
-            return answer, spent
-
-        apparatus_of(one.seeds[0])  # light that all ways share is on nobody's computing time
-        for way in ways:
-            tell_stage(f"{way.name}, {time_s * 1e3:g} ms")
-            row = StrategyRow(way.name, way.light, one.name, one.air, rule, 1e3 * time_s, len(true_m))
-            classes = _classes(config, geometry, way.light, power_w, rule, time_s)
-            row = replace(row, laser_class=classes[0], laser_class_still=classes[1])
-            begun = time.perf_counter()
-            scores: list[Score] = []
-            reached = Reached(true_m)
-            spent: list[tuple[float, float]] = []
-            try:
-                for seed in one.seeds:
-                    answer, used = measure(way, seed)
-                    spent.append((used.time_s, used.energy_j))
-                    scores.append(score(answer, truth, geometry, scored))
-                    reached.add(answer.depth_m[scored])
-            except TooShort as why:
-                yield replace(row, too_short=str(why), compute_s=time.perf_counter() - begun)
-                continue
-            spent_ms, energy_mj = (1e3 * statistics.fmean(each) for each in zip(*spent, strict=True))
-            row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=spent_ms, energy_mj=energy_mj)
-            yield replace(row, compute_s=time.perf_counter() - begun)
+def _measure(scene: OpenScene, way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, Spent]:
+    """A strategy's answer, and the time and energy that it took. Raises RigError if that is more than it had."""
+    apparatus = scene.apparatus(rule, seed)
+    try:
+        answer = way.measure(apparatus, scene.geometry, Budget(time_s), seed)
+    except (TooShort, RigError):
+        raise
+    except Exception as error:
+        error.add_note(f"raised by the strategy {way.name} in {time_s * 1e3:g} ms: tell its authors")
+        raise
+    require_form(answer, way.name, scene.geometry.shape)
+    spent = apparatus.spent
+    if spent.time_s > time_s * (1 + OVERSPENT):
+        raise RigError(f"{way.name} took {spent.time_s * 1e3:g} ms of {time_s * 1e3:g} ms; correct the strategy")
+    return answer, spent
 
 
 def require_form(answer: Answer, name: str, shape: tuple[int, int]) -> None:

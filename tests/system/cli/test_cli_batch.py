@@ -103,10 +103,12 @@ def test_a_study_of_strategies_has_the_rows_of_the_comparison(tmp_path: Path) ->
     assert without(("compute_s",), found["rows"]) == without(("compute_s",), expected["rows"])
     assert {key for key in expected if found[key] != expected[key]} <= {"rows", "seconds"}
     assert [row.labels for row in done.rows()] == [
-        {"scene": "ramp", "fog": fog, "rule": "energy", "time": "20ms"} for fog in ("clear", "20m")
+        {"scene": "ramp", "fog": fog, "rule": "energy", "time": "20ms", "strategy": way}
+        for fog in ("clear", "20m")
+        for way in asked["strategies"]
     ]
     planned = api.plan_batch({**study, "omit": [{"fog": "20m", "time": "20ms"}]}, out=tmp_path / "none")
-    assert planned.cases == 1
+    assert planned.cases == 2
 
 
 @pytest.mark.usefixtures("here")

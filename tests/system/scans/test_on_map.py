@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.frames import FrameBlock
 from drivers.interfaces import LineLaser
 from rig import api
 from rig.api import SeenMap, scans
 from rig.config.models import RigConfig
 from rig.errors import PlanError, UsageError
+from rig.scan.on_request import PartsRecording
 from tests.system import small_rig
 
 
@@ -151,7 +154,22 @@ def test_without_a_folder_nothing_is_written_and_the_results_are_all_there(small
 
 @pytest.mark.slow
 def test_the_python_of_the_page_runs(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a small rig in the place of the bundled one."""
+    """With a small rig in the place of the bundled one. Its four maps are 33 ms of light: the recorder gets the last
+    frames once the switch has been used, however slow the maps are."""
+    used = threading.Event()
+    on, note = api.RecordingSwitch.on, PartsRecording._note
+
+    def switched_on(self: api.RecordingSwitch) -> None:
+        on(self)
+        used.set()
+
+    def noting(self: PartsRecording, block: FrameBlock) -> None:
+        if block.header.sweep >= 2:
+            assert used.wait(60)
+        note(self, block)
+
+    monkeypatch.setattr(api.RecordingSwitch, "on", switched_on)
+    monkeypatch.setattr(PartsRecording, "_note", noting)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(api, "scan", partial(api.scan, small))
     page = (Path(__file__).parents[3] / "docs/how-to/steer.md").read_text()

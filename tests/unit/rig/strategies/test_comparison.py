@@ -14,17 +14,28 @@ import yaml
 from calibration.files.rig_file import load_rig_model
 from rig.api import compare_strategies
 from rig.api.strategies import as_cases
+from rig.config.files import portable_content
+from rig.config.overrides import configure
 from rig.errors import RigError, UsageError
 from rig.requests import StrategiesRequest
 from rig.strategies.comparison import compare
-from rig.strategies.comparison.compare import Comparison, Reached, StrategyRow, ranges, require_form, run_comparison
+from rig.strategies.comparison.compare import (
+    Comparison,
+    Reached,
+    StrategyRow,
+    measure_once,
+    ranges,
+    require_form,
+    run_comparison,
+)
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
 from rig.strategies.comparison.places import air_problems, scene_file, visibility_m
+from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
 from tests.system import small_rig
 
-covers(visibility_m, scene_file, Reached, Comparison, require_form, run_comparison, ranges)
+covers(visibility_m, scene_file, OpenScene, measure_once, Reached, Comparison, require_form, run_comparison, ranges)
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +137,24 @@ def test_scenes_of_the_same_name_are_told_apart_and_cases_are_the_parts_of_a_com
     assert parts == [replace(row, compute_s=0.0) for row in whole.rows]
 
 
+def test_a_scene_stays_open_until_another_is_wanted_or_its_files_have_changed(config, tmp_path):
+    def write(depth_m):
+        surfaces = {"depth_m": np.full((40, 96), depth_m, np.float32), "albedo": np.full((40, 96), 0.5, np.float32)}
+        np.savez(tmp_path / "world.npz", **surfaces)
+
+    write(2.0)
+    content = portable_content(configure(config))
+    place = Place("wall", str(tmp_path), "clear", 4, None)
+    first = open_scene(content, place)
+    assert open_scene(content, replace(place)) is first
+    write(3.0)
+    changed = open_scene(content, place)
+    assert np.allclose(changed.true_m, 3.0, atol=0.2)
+    assert open_scene(content, replace(place, air="20m")) is not changed
+    assert open_scene(content, place) is not changed
+    close_scene()
+
+
 def test_several_seeds_give_a_spread(config):
     found = compare_strategies(
         config,
@@ -162,7 +191,8 @@ def test_a_way_that_overspends_is_an_error(config, monkeypatch):
             nothing = np.zeros(geometry.shape, np.float32)
             return Answer(nothing * np.nan, nothing)
 
-    monkeypatch.setattr("rig.api.strategies.find_strategy", lambda name: Greedy())
+    for module in ("rig.api.strategies", "rig.strategies.comparison.compare"):
+        monkeypatch.setattr(f"{module}.find_strategy", lambda name: Greedy())
     with pytest.raises(RigError, match="greedy took 4 ms of 2 ms"):
         compare_strategies(config, strategies=["greedy"], times=["2ms"], scenes=["ramp"], fogs=["clear"], rows=4)
 

@@ -210,6 +210,7 @@ def test_an_interrupt_leaves_the_rows_that_are_whole(monkeypatch, whole):
         with pytest.raises(KeyboardInterrupt):
             run_tradeoff(trials, asked, None)
         return
+    monkeypatch.setattr("rig.batch.engine.SAID_S", 0.0)
     told = []
     found = run_tradeoff(trials, asked, None, lambda *frames: told.append(frames))
     assert [row.exposures for row in found.rows] == [1, 3]

@@ -1,0 +1,63 @@
+"""Does cases in this process, one after the other, so that each has the whole computer for itself.
+
+This is for cases whose computing time is a result. An error of a case is raised as it is, and ends the batch.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from rig.batch.case import Case, Result
+from rig.batch.engine import run_batch
+from rig.batch.store import Store
+from rig.batch.task import Ended, Task, perform
+from rig.errors import UsageError
+from rig.progress import Progress, part
+
+
+class Here:
+    """An executor in this process; see `rig.batch.engine.Executor`. what: noun for a case; total: number of cases."""
+
+    workers = 1
+    notes: Sequence[str] = ()
+
+    def __init__(self, what: str, total: int) -> None:
+        self._what, self._total = what, total
+        self._begun = 0
+        self._task: Task | None = None
+
+    @property
+    def room(self) -> int:
+        """1 if it has no task, else 0."""
+        return int(self._task is None)
+
+    def submit(self, task: Task) -> None:
+        """Take a task, which `wait` does."""
+        self._task = task
+        self._begun += 1
+
+    def wait(self) -> list[Ended]:
+        """Do the task that was taken. Raises what the case raises."""
+        task, self._task = self._task, None
+        assert task is not None, "called with a task under way"
+        with part(f"{self._what} {self._begun} of {self._total}"):
+            return [perform(task, raises=True)]
+
+    def close(self) -> None:
+        """Forget the task that was taken."""
+        self._task = None
+
+
+def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) -> tuple[list[Result | None], bool]:
+    """Do all cases in this process.
+
+    what: noun for a case, such as 'scan'. progress: called with the number of finished cases and of all.
+
+    Returns the results in the order of the cases, and whether an interrupt ended it; those that are missing then are
+    None. Raises what a case raises, and UsageError if a file that a case reads has changed meanwhile.
+    """
+    with tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder, Store(Path(folder) / "all", cases) as store:
+        done = run_batch(store, Here(what, len(store.cases)), progress=progress)
+        if done.failures:
+            raise UsageError(f"{done.failures[0].message}; run the command again")
+        return store.results(), done.verdict == "aborted"
