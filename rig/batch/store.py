@@ -183,7 +183,7 @@ class Store:
         return read_rows(self.folder)
 
     def results(self) -> list[Result | None]:
-        """What the given cases have returned, in their order; None for those that are not finished."""
+        """The results of the given cases, in their order; None for those that are not finished."""
         found = {row.case: {**row.result, MEASURED: row.measured} for row in self.rows()}
         return [found.get(name) for name in self.names]
 
