@@ -76,6 +76,7 @@ def config_of(kind: type[Config], **fields: object) -> Config:
     number in SI units: `max_power_w=0.05`; None counts as not given. Raises `LimitExceeded`, with one line, for the
     first wrong field.
     """
+    given: dict[str, str] = {}
     for name, about in kind.model_fields.items():
         dimension = dimension_of(about)
         if dimension is None:
@@ -83,17 +84,23 @@ def config_of(kind: type[Config], **fields: object) -> Config:
         key = "_".join(filter(None, (name, IN_NAMES[dimension])))
         if not isinstance(fields.get(name, ""), str) and key != name:
             raise LimitExceeded(f"{name} is {fields[name]!r}; give {key}, a number in SI units")
-        value = fields.get(key)
-        if key in fields and not isinstance(value, str):
-            del fields[key]
+        if key in fields and key != name:
+            value = fields.pop(key)
+            if isinstance(value, str):
+                raise LimitExceeded(f"{key} is {value!r}; give a number in SI units, or {name}={value!r}")
             if value is not None:
                 fields[name] = _quantity(key, value, dimension)
+                given[name] = f"{key} = {value!r}"
+        elif key in fields and not isinstance(fields[key], str):
+            fields[name] = _quantity(key, fields[key], dimension)
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
         wrong = error.errors()[0]
         where = ".".join(str(part) for part in wrong["loc"])
-        raise LimitExceeded(f"{where or kind.__name__}: {wrong['msg']}; correct this argument") from None
+        raise LimitExceeded(
+            f"{given.get(where, where) or kind.__name__}: {wrong['msg']}; correct this argument"
+        ) from None
 
 
 def _quantity(name: str, value: Any, dimension: str) -> str:

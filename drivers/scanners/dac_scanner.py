@@ -10,7 +10,9 @@ million points that is repeated for hours takes only its own memory.
 
 import logging
 import math
+import os
 import threading
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -192,8 +194,31 @@ class Dac(Protocol):
         """Make the outputs safe and release the device."""
 
 
+class _Motion:
+    """State of a mirror, shared by its scanner and the thread that feeds the board. Does not refer to the scanner."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.position: float | None = 0.0
+        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
+        self.stopping = threading.Event()
+        self.thread: threading.Thread | None = None
+        self.error: DeviceError | None = None
+        """The error that ended the last waveform, or the holding of the mirror after it; None: there was none."""
+
+    def join(self) -> None:
+        """Wait for the thread that feeds the board. Several threads may wait at once."""
+        thread = self.thread
+        if thread is not None:
+            with suppress(RuntimeError):  # an interrupt came before it was started
+                thread.join()
+            if self.thread is thread:
+                self.thread = None
+
+
 class DacScanner(BeamScanner):
-    """One mirror axis. While a waveform is played, a thread feeds the board."""
+    """One mirror axis. While a waveform is played, a thread feeds the board. If nobody closes the scanner, that is done
+    when the object is deleted or Python ends."""
 
     @classmethod
     def at(
@@ -221,12 +246,8 @@ class DacScanner(BeamScanner):
         self._park = config.park
         self._limits = config.limits(dac.highest_rate_hz)
         self._loaded: tuple[ScanWaveform, int] | None = None
-        self._position: float | None = 0.0
-        """Command at which the mirror rests; None: it is moving, or its place is unknown after a fault."""
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._error: DeviceError | None = None
-        """The error that ended the last waveform, or the holding of the mirror after it; None: there was none."""
+        self._motion = _Motion(dac.name)
+        self._forgotten = weakref.finalize(self, _forgotten, self._motion, dac, os.getpid())
 
     @property
     def identity(self) -> str:
@@ -244,19 +265,20 @@ class DacScanner(BeamScanner):
         return self._limits
 
     def _do_status(self) -> ScannerStatus:
-        moving = self._thread is not None and self._thread.is_alive()
-        if isinstance(self._error, DeviceDisconnected):
-            raise self._error
-        if not moving and self._error is None:
+        motion = self._motion
+        moving = motion.thread is not None and motion.thread.is_alive()
+        if isinstance(motion.error, DeviceDisconnected):
+            raise motion.error
+        if not moving and motion.error is None:
             self._dac.check()
-        fault = None if self._error is None else str(self._error)
-        return ScannerStatus(moving=moving, fault=fault, position=None if moving else self._position)
+        fault = None if motion.error is None else str(motion.error)
+        return ScannerStatus(moving=moving, fault=fault, position=None if moving else motion.position)
 
     def _do_point_clock(self, requested_hz: float) -> Fraction:
         return self._dac.point_clock(requested_hz, *self._limits.point_rate_hz)
 
     def _do_load(self, waveform: ScanWaveform, repeats: int, clock_hz: Fraction) -> None:
-        self._join()
+        self._motion.join()
         self._loaded = (ScanWaveform(waveform.command.copy(), waveform.markers.copy(), clock_hz), repeats)
 
     def _do_start(self) -> None:
@@ -266,13 +288,13 @@ class DacScanner(BeamScanner):
         first = float(waveform.command[0])
         source = PointSource(self._rest(), first, self._limits, float(clock_hz), waveform, repeats)
         run = self._dac.run(source, clock_hz)
-        self._error = None
         self._begin(run)
-        self._thread = threading.Thread(target=self._feed, args=(run,), name=self.name, daemon=True)
-        self._thread.start()
+        fed = run, self._motion, weakref.ref(self)
+        self._motion.thread = threading.Thread(target=_feed, args=fed, name=self.name, daemon=True)
+        self._motion.thread.start()
 
     def _do_stop(self) -> None:
-        self._stopping.set()
+        self._motion.stopping.set()
         self._rest()
 
     def _do_park(self) -> None:
@@ -284,11 +306,12 @@ class DacScanner(BeamScanner):
             super()._make_safe()
 
     def _do_close(self) -> None:
-        self._stopping.set()
-        self._join()  # no other thread may talk to the board while it is closed
+        self._forgotten.detach()
+        self._motion.stopping.set()
+        self._motion.join()  # no other thread may talk to the board while it is closed
         try:
             try:
-                if self._position is not None:
+                if self._motion.position is not None:
                     self._go(0.0)
             finally:
                 self._dac.close()
@@ -302,51 +325,66 @@ class DacScanner(BeamScanner):
         if run.source.left:
             self._begin(run)
             try:
-                run.feed(self._stopping)
+                run.feed(self._motion.stopping)
             except BaseException:
                 run.give_up()
                 raise
-            self._position = run.source.last
+            self._motion.position = run.source.last
+        self._motion.error = None
 
     def _begin(self, run: DacRun) -> None:
-        self._stopping.clear()
-        self._position = None
+        self._motion.stopping.clear()
+        self._motion.position = self._motion.error = None
         try:
             run.begin()
         except BaseException:
             run.give_up()
             raise
 
-    def _feed(self, run: DacRun) -> None:
-        """Feed the device, in the thread. An error ends the run, and `status` reports it or raises it."""
-        try:
-            run.feed(self._stopping)
-            self._position = run.source.last
-        except Exception as error:  # a driver's own fault too must end a scan: its frames have no markers any more
-            self._error = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
-            _log.error("%s", error)
-            try:
-                if self.on_fault is not None:
-                    self.on_fault()
-            except Exception:  # the run is given up all the same
-                _log.exception("%s: on_fault", self.name)
-            run.give_up()
-
     def _rest(self) -> float:
         """Wait for a run to end; returns the drive at which the mirror rests. If that is unknown, halts the board."""
-        self._join()
-        if self._position is None:
-            self._position = self._dac.halt()
-        return self._position
+        self._motion.join()
+        if self._motion.position is None:
+            self._motion.position = self._dac.halt()
+        return self._motion.position
 
-    def _join(self) -> None:
-        """Wait for the thread that feeds the board. Several threads may wait at once."""
-        thread = self._thread
-        if thread is not None:
-            with suppress(RuntimeError):  # an interrupt came before it was started
-                thread.join()
-            if self._thread is thread:
-                self._thread = None
+
+def _feed(run: DacRun, motion: _Motion, of: "weakref.ref[DacScanner]") -> None:
+    """Feed the device, in the thread. An error ends the run, and `status` reports it or raises it."""
+    try:
+        run.feed(motion.stopping)
+        motion.position = run.source.last
+    except Exception as error:  # a driver's own fault too must end a scan: its frames have no markers any more
+        told = error if isinstance(error, DeviceError) else DeviceFault(f"{motion.name} failed: {error!r}")
+        motion.error = told
+        _log.error("%s", told)
+        scanner = of()
+        try:
+            if scanner is not None and scanner.on_fault is not None:
+                scanner.on_fault()
+        except Exception:  # the run is given up all the same
+            _log.exception("%s: on_fault", motion.name)
+        run.give_up()
+
+
+def _forgotten(motion: _Motion, dac: Dac, process: int) -> None:
+    """Brake the mirror of a scanner that was deleted, or is open when Python ends, and close its board. Errors are only
+    logged. process: number of the process that opened it; in another one, forked from it, nothing is done."""
+    if os.getpid() != process:
+        return
+    if motion.thread is threading.current_thread():  # `on_fault` had the last reference to the scanner
+        threading.Thread(target=_forgotten, args=(motion, dac, process)).start()
+        return
+    moved = motion.thread is not None or motion.position != 0.0
+    motion.stopping.set()
+    try:
+        motion.join()
+        dac.close()
+    except Exception as error:
+        _log.error("%s: was not closed, and could not be stopped: %s", motion.name, error)
+        return
+    if moved:
+        _log.warning("%s: was not closed; its mirror was stopped and is at the centre", motion.name)
 
 
 Config = TypeVar("Config", bound=GalvoConfig)

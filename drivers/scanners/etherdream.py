@@ -58,6 +58,10 @@ _HARDWARE_KNOWN = (0, 1, 2, 10)
 """Hardware revisions of the first generation, and of the Ether Dream 2 that was measured."""
 
 
+class Stopped(DeviceFault):
+    """The board stays in emergency stop."""
+
+
 class EtherDreamConfig(GalvoConfig):
     """Config of an Ether Dream and of the galvo behind it."""
 
@@ -83,7 +87,7 @@ class EtherDreamDac:
         self._stream: PointStream | None = None
         self._holder: threading.Thread | None = None
         self._letting_go = threading.Event()
-        self._fault: DeviceError | None = None
+        self.fault: DeviceError | None = None
         """The error that ended the holding of the mirror."""
         try:
             # Nothing broadcasts on a loopback interface; an emulated board must not cost the wait.
@@ -124,8 +128,8 @@ class EtherDreamDac:
 
     def check(self) -> None:
         """Raise `DeviceError` if the board does not answer, or the error that ended the holding of the mirror."""
-        if self._fault is not None:
-            raise self._fault
+        if self.fault is not None:
+            raise self.fault
         if self._stream is None:
             self._line.ask(PING)
         else:
@@ -172,7 +176,7 @@ class EtherDreamDac:
         self._letting_go.set()
         if holder is not None and holder.ident is not None:
             holder.join()
-        fault, self._fault = self._fault, None
+        fault, self.fault = self.fault, None
         return fault
 
     def _hold(self, stream: PointStream, command: float, letting_go: threading.Event) -> None:
@@ -181,7 +185,7 @@ class EtherDreamDac:
                 stream.hold(command)
                 self.clock.sleep(_HOLD_POLL_S)
         except Exception as error:
-            self._fault = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
+            self.fault = error if isinstance(error, DeviceError) else DeviceFault(f"{self.name} failed: {error!r}")
             _log.error("%s", error)
 
     def _settle(self) -> None:
@@ -204,7 +208,7 @@ class EtherDreamDac:
         """Leave the emergency stop. Raises `DeviceFault` if its cause persists."""
         reply: Reply = self._line.ask(CLEAR)
         if reply.code == STILL_STOPPED or reply.light_engine != READY or reply.playback != IDLE:
-            raise DeviceFault(
+            raise Stopped(
                 f"{self.name}: stays in emergency stop (state {reply.light_engine}); release its stop input, then "
                 "start again"
             )
@@ -259,6 +263,8 @@ class EtherDreamRun(DacRun):
 class EtherDream(DacScanner):
     """A galvo behind an Ether Dream."""
 
+    _dac: EtherDreamDac
+
     @classmethod
     def open(
         cls,
@@ -293,9 +299,25 @@ class EtherDream(DacScanner):
     def _do_status(self) -> ScannerStatus:
         try:
             return super()._do_status()
-        except DeviceFault as error:  # the mirror is not held any more
-            self._position, self._error = None, error
+        except DeviceFault:
+            self._note_lost_hold()
             return super()._do_status()
+
+    def _make_safe(self) -> None:
+        try:
+            super()._make_safe()
+        except Stopped as error:  # somebody holds its stop input: it is dark, with the mirror at the centre
+            _log.warning("%s", error)
+
+    def _rest(self) -> float:
+        self._note_lost_hold()
+        return super()._rest()
+
+    def _note_lost_hold(self) -> None:
+        """Note if the mirror is not held any more where it rested."""
+        fault = self._dac.fault
+        if fault is not None and self._motion.error is None:
+            self._motion.position, self._motion.error = None, fault
 
 
 def _opened(config: EtherDreamConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> EtherDream:

@@ -506,10 +506,11 @@ class Nidaq(DacScanner):
         super().__init__(dac, config)
         self._card, self._counters = dac.card, config.counters
         try:
-            self._position = dac.halt()
-            if self._position:
+            self._motion.position = dac.halt()
+            if self._motion.position:
                 self._go(0.0)
         except BaseException:
+            self._forgotten.detach()
             dac.card.disconnect()
             raise
 

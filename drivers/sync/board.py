@@ -1,6 +1,11 @@
-"""The base of boards that play patterns: pins of the user's choice, and outputs that go low if a start fails."""
+"""The base of boards that play patterns: pins of the user's choice, and outputs that go low if a start fails, and if
+nobody closes the board."""
 
 import logging
+import os
+import threading
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -62,16 +67,34 @@ class SyncBoard(SyncSource):
 
     _lowered = 0
     """Number of calls of `gate_low` and `abort`."""
+    _questions: frozenset[str]
+    """Raw commands that change nothing."""
+    _may_play: threading.Event
+    """Set from the first call of a run, or a raw command, until all outputs are low again."""
+
+    def _watch_for_end(self, lower: Callable[[], object], release: Callable[[], object]) -> None:
+        """From now on take the outputs low if a program may still play when the device is deleted, or Python ends,
+        without `close`. lower takes all outputs low, release gives up the port; neither may refer to the device."""
+        self._may_play = threading.Event()
+        given = self.name, lower, release, self._may_play, os.getpid()
+        self._forgotten = weakref.finalize(self, _forgotten, *given)
+
+    def _note_raw(self, command: str) -> None:
+        """Note that a raw command may raise the gate, unless it is one of `_questions`."""
+        if command.split(" ", 1)[0] not in self._questions:
+            self._may_play.set()
 
     def gate_low(self) -> None:
         """See `SyncSource`. A `run` on its way is ended, too."""
         self._lowered += 1
         super().gate_low()
+        self._may_play.clear()
 
     def abort(self) -> None:
         """See `SyncSource`. A `run` on its way is ended, too."""
         self._lowered += 1
         super().abort()
+        self._may_play.clear()
 
     def run(self) -> None:
         """Play the program from its first word. If that fails once begun, or another thread calls `gate_low` or `abort`
@@ -79,6 +102,7 @@ class SyncBoard(SyncSource):
         lowered = self._lowered
         try:
             super().run()
+            self._may_play.set()  # another thread may have lowered the outputs before the run was sent
             if self._lowered != lowered:
                 raise DeviceFault(f"{self.name}: run was ended by gate_low or abort; run again")
         except WrongState:
@@ -89,3 +113,24 @@ class SyncBoard(SyncSource):
             except DeviceError as error:
                 _log.error("%s: outputs may be high, turn the laser off by its key: %s", self.name, error)
             raise
+
+
+def _forgotten(
+    name: str, lower: Callable[[], object], release: Callable[[], object], may_play: threading.Event, process: int
+) -> None:
+    """Take the outputs of a board low that may play a program, and release its port. Errors are only logged.
+
+    process: number of the process that opened it; in another one, forked from it, nothing is done.
+    """
+    if os.getpid() != process:
+        return
+    if may_play.is_set():
+        may_play.clear()  # a thread that watches the program must not take its end for a fault
+        try:
+            lower()
+            _log.warning("%s: may have been left playing; its outputs were taken low", name)
+        except DeviceError as error:
+            may_play.set()
+            key = "turn the laser off by its key"
+            _log.error("%s: was left playing and may open the gate, %s (%s)", name, key, error)
+    release()

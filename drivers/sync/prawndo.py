@@ -152,6 +152,7 @@ class PrawnDo(SerialDevice, SyncBoard):
     """A PrawnDO board. Opening it first takes all outputs low, whatever the board was doing."""
 
     _line: PrawnDoLine
+    _questions = frozenset({"ver", "brd", "sts", "deb", "ndb", "frq", "len", "dmp", "cur", "get"})
 
     def __init__(self, config: PrawnDoConfig, surroundings: Surroundings, timing: PrawnDoTiming = USUAL_TIMING) -> None:
         super().__init__("PrawnDO")
@@ -171,6 +172,7 @@ class PrawnDo(SerialDevice, SyncBoard):
         except BaseException:
             self._line.port.close()
             raise
+        self._watch_for_end(self._line.lower, port.close)
 
     @classmethod
     def open(
@@ -190,7 +192,13 @@ class PrawnDo(SerialDevice, SyncBoard):
         """Send a raw command and return the lines of the board's answer. Nothing is checked: a command such as `man`
         can raise the gate. Raises `DeviceError` if no answer comes."""
         self._require("ask", *OPEN_STATES)
+        self._note_raw(command)
         return self._line.transact(command)
+
+    def send(self, command: str) -> None:
+        """See `SerialDevice`."""
+        self._note_raw(command)
+        super().send(command)
 
     @property
     def identity(self) -> str:
@@ -227,6 +235,7 @@ class PrawnDo(SerialDevice, SyncBoard):
             self._confirmed = True
 
     def _do_run(self) -> None:
+        self._may_play.set()
         with self._line.lock:
             if not self._confirmed:
                 raise DeviceFault(f"{self.name}: its program did not arrive whole; program it again")
@@ -245,6 +254,7 @@ class PrawnDo(SerialDevice, SyncBoard):
             return SyncStatus(_STATES[state], outputs)
 
     def _do_close(self) -> None:
+        self._forgotten.detach()
         self._line.port.close()
 
     def _identify(self) -> tuple[str, int]:

@@ -24,7 +24,6 @@ hardware trigger armed, and says that it plays nothing; and as None otherwise.
 """
 
 import logging
-import os
 import re
 import threading
 import weakref
@@ -141,9 +140,9 @@ class PulseStreamer(SyncBoard):
         """Whether the box has confirmed that all is low and that no trigger can change it."""
         self._aborts = 0
         self._ended: Literal["stopped", "aborted"] = "stopped"
-        self._armed = threading.Event()
-        """Set from the first call of a run until all is low again."""
         self._lost = False
+        # The connection is one call long: there is nothing to release.
+        self._watch_for_end(partial(_lower_box, self._rpc), lambda: None)
         try:
             self._rpc.call("constant", LOW)
         except GONE as error:
@@ -152,7 +151,6 @@ class PulseStreamer(SyncBoard):
         self._lower()
         self._firmware = self._check_firmware()
         self._serial = one_line(self._rpc.call("getSerial"))
-        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._rpc, self._armed, os.getpid())
         self._rpc.call("selectClock", CLOCKS[config.clock])
         self._check_clock()
         self._check_timing()
@@ -174,6 +172,9 @@ class PulseStreamer(SyncBoard):
         """Call a method of the box, such as `ask("getTemperature")`, and return its result. Nothing is checked: a
         method such as `constant` can raise the gate. Raises `DeviceError` if no answer comes."""
         self._require("ask", *OPEN_STATES)
+        if not method.startswith(("get", "has", "is")):
+            self._may_play.set()
+            self._safe = False
         return self._rpc.call(method, *params)
 
     @property
@@ -218,10 +219,10 @@ class PulseStreamer(SyncBoard):
             self._require_no_abort(aborts)
             return self._rpc.call(method, *params)
 
+        self._may_play.set()
         try:
             with self._lock:
                 self._safe = False
-                self._armed.set()
                 step("constant", (0, sequence.rest, 0, 0))
                 step("setTrigger", start, MANUAL if once else AUTO)
                 self._require_no_abort(aborts)
@@ -279,12 +280,12 @@ class PulseStreamer(SyncBoard):
         except DeviceTimeout:
             self._rpc.call("constant", LOW)
         with self._lock:
-            if self._run is not None:
-                self._run.over.set()
-                self._run, self._ended = None, ended
             self._safe = False
             _replace_program(self._rpc)
-            self._armed.clear()
+            if self._run is not None:  # only now: until then the thread that watches it has to try again
+                self._run.over.set()
+                self._run, self._ended = None, ended
+            self._may_play.clear()
             self._safe = True
 
     def _has_ended(self, run: _Run, asked_s: float, plays: bool, ask: Callable[[str], Any] | None = None) -> bool:
@@ -316,7 +317,9 @@ class PulseStreamer(SyncBoard):
                 self._check_trigger(RISING, ask)
                 checked_s = asked_s
         except Exception as error:
-            if not run.over.is_set():
+            with self._lock:  # another thread may just be taking the outputs low
+                ended = run.over.is_set() or not self._may_play.is_set()
+            if not ended:
                 advice = "the gate may open at every scan marker, turn the laser off by its key"
                 _log.error("%s: while a program runs: %s; %s", self.name, error, advice)
                 self._lost = True
@@ -405,17 +408,10 @@ def _replace_program(rpc: JsonRpc) -> None:
     rpc.call("stream", _DARK, 1, LOW)
 
 
-def _forgotten(name: str, rpc: JsonRpc, armed: threading.Event, process: int) -> None:
-    """Take the outputs low if a program may still run when Python ends or the device is deleted without `close`. Only
-    logs errors. process: number of the process that opened it; in another one, forked from it, nothing is done."""
-    if os.getpid() != process or not armed.is_set():
-        return
-    try:
-        rpc.call("constant", LOW)
-        _replace_program(rpc)
-        _log.warning("%s: was left running; its outputs were taken low", name)
-    except DeviceError as error:
-        _log.error("%s: was left running and may open the gate, turn the laser off by its key (%s)", name, error)
+def _lower_box(rpc: JsonRpc) -> None:
+    """Take the outputs of a box low whose driver is gone, and disarm it."""
+    rpc.call("constant", LOW)
+    _replace_program(rpc)
 
 
 KIND = Kind(config=PulseStreamerConfig, create=PulseStreamer)

@@ -16,6 +16,7 @@ import weakref
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -100,6 +101,7 @@ class Teensy(SerialDevice, SyncBoard):
     """A Teensy. Opening it first takes all outputs low, whatever the board was doing."""
 
     _line: TeensyLine
+    _questions = frozenset({"id", "status"})
 
     def __init__(self, config: TeensyConfig, surroundings: Surroundings, reply_s: float | None = None) -> None:
         super().__init__("Teensy")
@@ -121,6 +123,7 @@ class Teensy(SerialDevice, SyncBoard):
         except BaseException:
             port.close()
             raise
+        self._watch_for_end(partial(self._line.lower, "abort"), self._line.close)
 
     @classmethod
     def open(cls, port: str, *, watchdog_s: float = WATCHDOG_S, surroundings: Surroundings | None = None) -> "Teensy":
@@ -136,7 +139,13 @@ class Teensy(SerialDevice, SyncBoard):
         """Send a raw command, once, and return the board's answer, also if it is an error. Nothing is checked: `run`
         can raise the gate, and nobody feeds its watchdog. Raises `DeviceError` if no answer comes."""
         self._require("ask", *OPEN_STATES)
+        self._note_raw(command)
         return self._line.ask(command, _ANY)[0]
+
+    def send(self, command: str) -> None:
+        """See `SerialDevice`."""
+        self._note_raw(command)
+        super().send(command)
 
     @property
     def identity(self) -> str:
@@ -169,6 +178,7 @@ class Teensy(SerialDevice, SyncBoard):
         if not self._loaded:
             raise DeviceFault(f"{self.name}: its program did not arrive whole; program it again")
         self._over.set()
+        self._may_play.set()
         self._line.ask(f"run {round(self._watchdog_s * 1e3)}", STATUS)
         self._over = threading.Event()
         feeding = weakref.ref(self), self._over, self._watchdog_s / _BEATS
@@ -185,6 +195,7 @@ class Teensy(SerialDevice, SyncBoard):
 
     def _do_close(self) -> None:
         self._over.set()
+        self._forgotten.detach()
         self._line.close()
 
     def _beat(self, over: threading.Event) -> None:

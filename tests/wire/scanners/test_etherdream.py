@@ -364,6 +364,41 @@ def test_what_ends_a_run_or_the_hold_is_a_fault_and_the_next_run_begins_at_the_c
         assert wire.model.history.command(np.array([began_s]))[0] == CENTRE
 
 
+def test_a_mirror_that_is_not_held_any_more_is_parked_again_and_starts_at_once() -> None:
+    with wired() as wire, open_etherdream(wire, park=0.8) as device:
+
+        def lose() -> None:
+            with wire.lock:
+                for up in (False, True):
+                    wire.model.link(up, wire.now_s)
+            let_pass(wire, 0.3)
+            assert wire.model.history.command(np.array([wire.now_s]))[0] == CENTRE
+
+        device.park()
+        lose()
+        device.park()
+        assert wire.model.history.command(np.array([wire.now_s]))[0] == pytest.approx(0.8, abs=1e-3)
+        assert device.status.fault is None
+        lose()
+        device.load(cosine(device), 1)
+        device.start()
+        finish(device)
+        assert device.status.fault is None
+        lose()
+
+
+def test_a_board_in_emergency_stop_is_closed_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    with wired() as wire:
+        device = open_etherdream(wire)
+        device.load(cosine(device), 1000)
+        device.start()
+        let_pass(wire, 0.1)
+        with wire.lock:
+            wire.model.stop_input(True, wire.now_s)
+        device.close()
+        assert "stays in emergency stop" in caplog.text
+
+
 def test_a_single_point_too_many_shortly_before_the_end_is_a_fault() -> None:
     model = Recorder()
     with wired(model) as wire, open_etherdream(wire) as device:

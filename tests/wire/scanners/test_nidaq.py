@@ -1,5 +1,6 @@
 """The NI card's driver: its config, and what it does to an emulated card. Facts: docs/reference/devices/nidaq.md."""
 
+import gc
 import random
 import sys
 import threading
@@ -91,8 +92,12 @@ def test_a_config_that_cannot_be_is_refused(given: dict[str, Any], reason: str) 
 
 def test_a_notebook_gives_si_values_and_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     limits: dict[str, Any] = {"max_velocity_per_s": 400.0, "max_acceleration_per_s2": 1e6}
-    with pytest.raises(LimitExceeded, match=r"full_scale: .*less than or equal to 10"):
+    with pytest.raises(
+        LimitExceeded, match=r"^full_scale_v = 12.0: .*less than or equal to 10; correct this argument$"
+    ):
         Nidaq.open("Dev1", full_scale_v=12.0, **limits)
+    with pytest.raises(LimitExceeded, match=r"^full_scale_v is '5 V'; give a number in SI units, or full_scale='5 V'$"):
+        Nidaq.open("Dev1", full_scale_v="5 V", **limits)  # type: ignore[arg-type]
     with pytest.raises(LimitExceeded, match="give a terminal and its rate"):
         Nidaq.open("Dev1", clock="PFI0", **limits)
     with pytest.raises(DeviceNotFound, match=r"NoSuchCard.*; "):
@@ -421,6 +426,27 @@ def test_an_interrupt_at_any_line_leaves_the_markers_low_and_no_task(bench: NiBe
         assert bench.drive()[0] == 0, at
         assert not any(task.outputs for task in bench.model.tasks.values()), at
     assert at > 300
+
+
+@pytest.mark.parametrize("ended", ["deleted", "Python ends"])
+def test_a_scanner_that_nobody_closes_is_stopped_with_its_markers_low(
+    bench: NiBench, caplog: pytest.LogCaptureFixture, ended: str
+) -> None:
+    device = bench.open()
+    device.load(marked(device, 700), 1_000_000)
+    device.start()
+    eventually(lambda: bench.levels() != [0, 0, 0])
+    forgotten = device._forgotten
+    if ended == "deleted":
+        del device
+        gc.collect()
+    else:
+        forgotten()
+    assert bench.levels() == bench.levels(after_s=10.0) == [0, 0, 0]
+    assert bench.drive()[0] == 0
+    assert not any(task.outputs for task in bench.model.tasks.values())
+    assert "was not closed; its mirror was stopped and is at the centre" in caplog.text
+    bench.open().close()  # the card is free
 
 
 def test_a_marker_from_a_counter_is_low_after_a_stop_and_a_close() -> None:

@@ -1,5 +1,6 @@
 """The PrawnDO: golden bytes of docs/reference/devices/prawndo.md, and a test named after each of its traps."""
 
+import gc
 import threading
 
 import pytest
@@ -283,6 +284,28 @@ def test_a_run_that_is_interrupted_leaves_the_outputs_low(monkeypatch: pytest.Mo
         with pytest.raises(KeyboardInterrupt):
             device.run()
         assert wire.pins == 0
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_board_that_is_deleted_with_its_gate_high_is_taken_low(raw: bool, caplog: pytest.LogCaptureFixture) -> None:
+    with board() as wire:
+        device = wire.open()
+        if raw:
+            device.ask("man 2")
+        else:
+            device.program([Pulse(OUT_GATE, 30.0)], 1)
+            device.run()
+        assert wire.pins == OUT_GATE
+        del device
+        gc.collect()
+        assert wire.pins == 0
+        assert "may have been left playing; its outputs were taken low" in caplog.text
+        caplog.clear()
+        device = wire.open()  # its port is free
+        device.ask("ver")
+        del device
+        gc.collect()
+        assert not caplog.records
 
 
 @pytest.mark.parametrize(

@@ -29,10 +29,10 @@ from drivers.errors import (
     WrongState,
 )
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, Pulse
-from drivers.interfaces.sync import HOLD_S
+from drivers.interfaces.sync import HOLD_S, SyncStatus
 from drivers.sync import pulsestreamer_rpc
 from drivers.sync.board import OutputPins
-from drivers.sync.pulsestreamer import PulseStreamer, PulseStreamerConfig
+from drivers.sync.pulsestreamer import SOFTWARE, PulseStreamer, PulseStreamerConfig
 from drivers.sync.pulsestreamer_rpc import JsonRpc, discover
 from drivers.sync.pulsestreamer_sequence import (
     IDLE_POLL_S,
@@ -612,7 +612,7 @@ def test_a_box_that_was_out_of_reach_is_taken_low_when_the_network_is_back() -> 
         box.server.unplug()
         eventually(lambda: device.port_lost)
         box.server.plug()
-        eventually(lambda: not device._armed.is_set())
+        eventually(lambda: device.status.state == "aborted")
         box.trigger.pulse(box.now_s + 1e-3, 1e-3)
         box.clock.sleep(2e-3)
         assert box.pins == 0
@@ -628,9 +628,44 @@ def test_a_box_that_is_deleted_while_its_program_waits_is_taken_low(
         device.run()
         del device
         gc.collect()
-        eventually(lambda: "was left running; its outputs were taken low" in caplog.text)  # its thread may just ask
+        # Its thread may just ask.
+        eventually(lambda: "may have been left playing; its outputs were taken low" in caplog.text)
         box.trigger.pulse(box.now_s + 1e-3, 1e-3)
         box.clock.sleep(2e-3)
+        assert box.pins == 0
+
+
+def test_a_box_that_fails_to_disarm_is_told_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the last sweep. Some firmware may keep the sequence, and play it at the next marker."""
+    failed: list[str] = []
+    call = JsonRpc.call
+
+    def failing(rpc: JsonRpc, method: str, *params: Any) -> Any:
+        if method == "setTrigger" and params[0] == SOFTWARE and not failed:
+            failed.append(method)
+            raise DeviceTimeout("no answer")
+        return call(rpc, method, *params)
+
+    with pulse_box() as box, box.open() as device:
+        device.program(SWEEP, 1)
+        device.run()
+        monkeypatch.setattr(JsonRpc, "call", failing)
+        box.trigger.pulse(box.now_s + 1e-3, 1e-3)
+        eventually(lambda: failed and not device._may_play.is_set())
+        assert device.status == SyncStatus("aborted", 0)
+        assert device.port_lost
+
+
+def test_a_raw_call_may_raise_the_gate(caplog: pytest.LogCaptureFixture) -> None:
+    with pulse_box() as box:
+        device = box.open()
+        device.ask("getSerial")
+        assert device.status.outputs == 0
+        device.ask("constant", (0, 2, 0, 0))
+        assert device.status.outputs is None  # the box cannot be asked for its levels
+        del device
+        gc.collect()
+        assert "may have been left playing; its outputs were taken low" in caplog.text
         assert box.pins == 0
 
 
@@ -640,7 +675,7 @@ def test_a_box_that_is_forgotten_is_taken_low(caplog: pytest.LogCaptureFixture) 
         device.program(SWEEP, 3)
         device.run()
         device._forgotten()  # as when Python ends
-        assert "was left running; its outputs were taken low" in caplog.text
+        assert "may have been left playing; its outputs were taken low" in caplog.text
         box.trigger.pulse(box.now_s + 1e-3, 1e-3)
         box.clock.sleep(2e-3)
         assert box.pins == 0
