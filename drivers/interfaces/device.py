@@ -1,11 +1,12 @@
 """The base of all devices: a name, a state, methods that check the state, and a close that leaves the device safe."""
 
 import logging
+import operator
 from abc import ABC, abstractmethod
 from enum import Enum
 from typing import Self
 
-from drivers.errors import GONE, DeviceError, WrongState
+from drivers.errors import GONE, DeviceError, LimitExceeded, WrongState
 
 _log = logging.getLogger(__name__)
 
@@ -112,3 +113,11 @@ class Device(ABC):
     @abstractmethod
     def _do_close(self) -> None:
         """Release handles and memory. Called even if making the device safe failed."""
+
+
+def whole_number(device: str, name: str, value: object) -> int:
+    """An argument that must be a whole number, as an int. Raises `LimitExceeded` for anything else, such as 2.5."""
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise LimitExceeded(f"{device}: {name} is {value!r}; give a whole number") from None

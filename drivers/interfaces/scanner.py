@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import LimitExceeded
-from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState, whole_number
 
 _log = logging.getLogger(__name__)
 
@@ -121,6 +121,7 @@ class BeamScanner(Device):
         """
         self._note_end()
         self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
+        repeats = whole_number(self._name, "repeats", repeats)
         if repeats < 1:
             raise LimitExceeded(f"{self._name}: {repeats} repeats; give at least 1")
         clock_hz = self.point_clock(float(waveform.point_rate_hz))

@@ -5,10 +5,11 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Literal
 
 from drivers.errors import DeviceFault, LimitExceeded
-from drivers.interfaces.device import OPEN_STATES, Device, DeviceState
+from drivers.interfaces.device import OPEN_STATES, Device, DeviceState, whole_number
 
 _log = logging.getLogger(__name__)
 
@@ -92,6 +93,7 @@ class SyncSource(Device):
         """
         self._note_end()
         self._require("program", DeviceState.READY, DeviceState.CONFIGURED, first="abort")
+        repeats = whole_number(self._name, "repeats", repeats)
         self._check(pulses, repeats)
         self._do_program(pulses, repeats)
         self._state = DeviceState.CONFIGURED
@@ -147,11 +149,16 @@ class SyncSource(Device):
             raise LimitExceeded(f"{self._name}: {repeats} repeats; give at least 1")
         for index, pulse in enumerate(pulses):
             where = f"{self._name}: word {index}"
-            if not 0 <= pulse.outputs <= OUT_FRAME | OUT_GATE | OUT_MARKER:
-                raise LimitExceeded(f"{where} sets outputs 0x{pulse.outputs:x}; outputs are 0x0 to 0x7")
+            if not isinstance(pulse, Pulse):
+                raise LimitExceeded(f"{where} is {pulse!r}; give a Pulse")
+            outputs = whole_number(self._name, f"outputs of word {index}", pulse.outputs)
+            if not 0 <= outputs <= OUT_FRAME | OUT_GATE | OUT_MARKER:
+                raise LimitExceeded(f"{where} sets outputs 0x{outputs:x}; outputs are 0x0 to 0x7")
             if pulse.duration_s is None:
                 if pulse.outputs & OUT_GATE:
                     raise LimitExceeded(f"{where} waits with the gate high (0x{pulse.outputs:x}); clear OUT_GATE 0x2")
+            elif not isinstance(pulse.duration_s, Real):
+                raise LimitExceeded(f"{where} lasts {pulse.duration_s!r}; give a number of seconds")
             elif not (math.isfinite(pulse.duration_s) and pulse.duration_s >= self.resolution_s / 2):
                 raise LimitExceeded(
                     f"{where} lasts {pulse.duration_s:g} s, under the resolution {self.resolution_s:g} s; lengthen it"

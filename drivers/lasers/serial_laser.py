@@ -86,8 +86,10 @@ def _forgotten(name: str, line: Dialogue, off: bytes, left: _Left, process: int)
         for command in left.put_back:
             line.port.write_again(line.encode(command), 1)
     except DeviceError as error:
-        trouble = "may shine, turn its key off" if left.may_shine else "its settings could not be put back"
-        _log.error("%s: was left armed and %s (%s)", name, trouble, error)
+        trouble = "was left armed and may shine, turn its key off"
+        if not left.may_shine:
+            trouble = "its settings could not be put back"
+        _log.error("%s: %s (%s)", name, trouble, error)
     line.port.close()
 
 
@@ -142,7 +144,8 @@ class SerialLaser(SerialDevice, LineLaser):
         `DeviceError` is raised.
         """
         self._require("ask", *OPEN_STATES)
-        self._left.may_shine = True
+        if not self._line.asks(command):
+            self._left.may_shine = True
         return self._line.ask(command, _ANY)
 
     def send(self, command: str) -> None:

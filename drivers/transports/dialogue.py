@@ -174,6 +174,10 @@ class Dialogue:
         """The bytes of a command."""
         return self._framing.encode(command)
 
+    def asks(self, command: str) -> bool:
+        """Whether a command only asks for something."""
+        return self._framing.asks(command)
+
     def send(self, command: str) -> None:
         """Send a command and wait for no reply. What the device says all the same is dropped before the next command.
         Raises `DeviceTimeout` if the port takes nothing, or `DeviceDisconnected`."""

@@ -185,7 +185,10 @@ class SerialPort:
                 f"{where} may not be opened by this user; install the udev rules {UDEV_RULES} and plug in again"
             )
         if number in _HELD:
-            return DeviceBusy(f"{where} is held by another program; close that program and try again")
+            return DeviceBusy(
+                f"{where} is held by another program; close that program, or the device if this program has it open, "
+                "and try again"
+            )
         return DeviceNotFound(f"{where} cannot be opened as a serial port ({one_line(error)}); correct 'port'")
 
     def _receive_some(self, least: int = 1) -> bool:

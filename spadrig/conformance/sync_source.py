@@ -1,7 +1,9 @@
 """The suite of every sync source: no light while waiting, the program as written, all outputs low at every end."""
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.errors import LimitExceeded, WrongState
@@ -56,9 +58,13 @@ class SyncSourceSuite:
         device, resolution_s = sync.device, sync.device.resolution_s
         lit, short = Pulse(OUT_GATE, sync.step_s), Pulse(OUT_GATE, 0.4 * resolution_s)
         all_high = OUT_GATE | OUT_FRAME | OUT_MARKER
-        refused: list[tuple[list[Pulse], int, str]] = [
+        refused: list[tuple[list[Any], Any, str]] = [
             ([], 1, "0 words"),
             ([lit], 0, "0 repeats"),
+            ([lit], 2.5, "repeats is 2.5; give a whole number"),
+            ([(OUT_GATE, sync.step_s)], 1, "word 0 is .*; give a Pulse"),
+            ([Pulse(0.5, sync.step_s)], 1, "outputs of word 0 is 0.5; give a whole number"),  # type: ignore[arg-type]
+            ([Pulse(0, "10 ms")], 1, "word 0 lasts '10 ms'; give a number of seconds"),  # type: ignore[arg-type]
             *(([Pulse(outputs, sync.step_s)], 1, "0x0 to 0x7") for outputs in (8, -1)),
             *(([lit, Pulse(0, duration_s)], 1, "word 1 lasts") for duration_s in (0.0, -1.0, math.nan, math.inf)),
             ([lit, short], 1, f"{0.4 * resolution_s:g} s, under the resolution {resolution_s:g} s"),
@@ -76,7 +82,7 @@ class SyncSourceSuite:
         refuse_all()
         assert device.state is DeviceState.READY
         assert sync.pins() == 0
-        device.program(sweep(sync), 1)
+        device.program(sweep(sync), np.int64(1))  # type: ignore[arg-type]
         refuse_all()
         device.run()
         assert device.status.state == sync.waiting

@@ -353,6 +353,16 @@ def test_a_laser_that_is_deleted_without_a_close_gets_its_settings_back(paused: 
     assert (model.autostart, model.prompt, model.state_on) == (True, True, False)
 
 
+@pytest.mark.parametrize("command", ["SYST:LOCK?", "SOUR:AM:STAT OFF"])
+def test_a_question_leaves_nothing_to_be_switched_off(command: str, caplog: pytest.LogCaptureFixture) -> None:
+    with wire(ObisModel()) as (_, surroundings):
+        laser = open_obis(surroundings)
+        laser.ask(command)
+        del laser
+        gc.collect()
+    assert ("it was told to switch off" in caplog.text) == (not command.endswith("?"))
+
+
 def test_a_laser_that_cannot_be_paused_keeps_autostart_off(monkeypatch: pytest.MonkeyPatch) -> None:
     model = ObisModel(autostart=True, cdrh_delay_s=0.0)
     with wire(model) as (_, surroundings):

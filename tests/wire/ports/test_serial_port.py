@@ -133,7 +133,7 @@ def test_what_is_no_port_is_refused_in_one_line(address: str, said: str) -> None
 
 @pytest.mark.usefixtures("port")
 def test_a_busy_port_is_refused(server: Server) -> None:
-    with pytest.raises(DeviceBusy, match="held by another program"):
+    with pytest.raises(DeviceBusy, match="held by another program; close that program, or the device if this program"):
         SerialPort("laser", server.endpoint)
 
 
