@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, cast
 
 from drivers.units import parse_quantity
@@ -11,6 +13,7 @@ from rig.config.bundled import short_names
 from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.errors import UsageError, each_or_problems, noted
+from rig.interrupts import interrupts_ignored
 from rig.progress import Progress
 from rig.requests import StrategiesRequest, TradeoffRequest
 from rig.run_folder.folder import RunFolder
@@ -23,7 +26,7 @@ from rig.strategies.comparison.compare import (
     tabulate,
 )
 from rig.strategies.comparison.files import write_files
-from rig.strategies.comparison.places import OWN, air_problems
+from rig.strategies.comparison.places import OWN, air_problems, rig_model, scene_file
 from rig.strategies.comparison.scene import LINES
 from rig.strategies.strategy import Strategy, find_strategy, strategy_names
 
@@ -61,7 +64,9 @@ def compare_strategies(
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
     with RunFolder(request.out) as folder:
-        return write_files(folder, run_comparison(loaded, ways, asked, progress))
+        done = run_comparison(loaded, ways, asked, progress)
+        with interrupts_ignored(done.verdict == "aborted"):
+            return write_files(folder, done)
 
 
 def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:
@@ -104,9 +109,12 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
         ways = each_or_problems(names, find_strategy)
     if problems:
         raise UsageError.of(problems)
+    scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
+    with TemporaryDirectory() as made:  # a scene that cannot be read is told before others have been measured
+        model = rig_model(loaded)
+        each_or_problems(scenes.values(), lambda scene: scene_file(scene, None, request.lux, model, Path(made)))
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
-    scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
     own = tuple(None if air == OWN else air for air in airs)
     asked = ComparisonPlan(scenes, own, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
     return loaded, ways, asked

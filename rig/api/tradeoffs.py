@@ -11,6 +11,7 @@ from rig.devices.calibration_use import accepted_by, calibration_use
 from rig.devices.open import open_rig
 from rig.errors import UsageError, noted
 from rig.estimate.registry import ESTIMATORS, FILTERS
+from rig.interrupts import interrupts_ignored
 from rig.progress import Progress
 from rig.requests import TradeoffRequest
 from rig.run_folder.folder import RunFolder
@@ -60,7 +61,9 @@ def tradeoff(
     if request.out is None:
         return run()
     with RunFolder(request.out) as folder:
-        return ready.write(folder, run())
+        done = run()
+        with interrupts_ignored(done.verdict == "aborted"):
+            return ready.write(folder, done)
 
 
 def as_cases(config: Config, request: TradeoffRequest) -> tuple[list[Case], WriteResults]:

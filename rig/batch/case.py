@@ -8,6 +8,7 @@ times, may differ from computer to computer; everything else must not.
 
 import functools
 import hashlib
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -131,16 +132,21 @@ def changed_file(files: Mapping[str, str]) -> str | None:
     """The first path whose content has not the given checksum; None if all have. Unchanged files are not read again."""
     for path, wanted in files.items():
         try:
-            top = Path(path)
-            stats = [(str(each), each.stat()) for each in _watched(top)]
-            stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
-            if _known.get(path, ([], ""))[0] != stamp:
-                _known[path] = stamp, checksum(path)
+            if current_checksum(path) != wanted:
+                return path
         except (OSError, UsageError):
             return path
-        if _known[path][1] != wanted:
-            return path
     return None
+
+
+def current_checksum(path: str) -> str:
+    """The checksum of a path, which is computed anew only if sizes or times have changed. Raises OSError or
+    UsageError."""
+    stats = [(str(each), each.stat()) for each in _watched(Path(path))]
+    stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    if _known.get(path, ([], ""))[0] != stamp:
+        _known[path] = stamp, checksum(path)
+    return _known[path][1]
 
 
 def _watched(top: Path) -> list[Path]:
@@ -162,7 +168,9 @@ def files_of(config: Mapping[str, Any], scene: str | None = None) -> tuple[str, 
     if isinstance(scene, str) and Path(scene).suffix in (".yaml", ".yml") and Path(scene).is_file():
         surfaces = load_yaml(Path(scene), "a scene", "surfaces: street").content.get("surfaces")
         paths.append(str(Path(scene).absolute().parent / surfaces) if isinstance(surfaces, str) else None)
-    return tuple(dict.fromkeys(path for path in paths if isinstance(path, str) and Path(path).exists()))
+    # Names of bundled scenes mean those, whatever lies in the current folder.
+    files = (path for path in paths if isinstance(path, str) and os.path.isabs(path) and os.path.exists(path))
+    return tuple(dict.fromkeys(files))
 
 
 def _checksum_of_file(file: Path) -> str:

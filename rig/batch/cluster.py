@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import secrets
+import signal
 import socket
 import threading
 import time
@@ -50,7 +51,9 @@ PATIENCE_S: Final = 300.0
 NO_WORKER_S: Final = 60.0
 """Seconds to wait for other workers if all have been retired."""
 ANSWER_S: Final = 10.0
-"""Seconds in which a scheduler answers at first."""
+"""Seconds in which something listens at a scheduler's address."""
+FIRST_ANSWER_S: Final = 30.0
+"""Seconds in which it answers as a scheduler."""
 LOOK_S: Final = 1.0
 """Seconds from one count of the workers to the next."""
 TAKEN_S: Final = 120.0
@@ -236,7 +239,7 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
     if "://" in cluster:
         try:
             _require_answer(cluster)
-            client = distributed.Client(cluster, timeout=PATIENCE_S, set_as_default=False)
+            client = distributed.Client(cluster, timeout=FIRST_ANSWER_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise UsageError(f"no scheduler answers at {cluster} ({error}); start one with `dask scheduler`") from error
         return Cluster(store, client, limits, close=client.close)
@@ -323,7 +326,7 @@ def _batch_system(file: Path) -> tuple[Any, int]:
     if problems:
         raise UsageError.of(problems)
     try:
-        module = import_module("dask_jobqueue")
+        module = _dask_jobqueue()
     except ImportError as error:
         raise UsageError(f"{file} needs the package dask-jobqueue; {install_command('dask-jobqueue')}") from error
     place, _, name = SYSTEMS[system].rpartition(".")
@@ -334,6 +337,16 @@ def _batch_system(file: Path) -> tuple[Any, int]:
         raise UsageError(f"{file}: {error}; its other keys are those of dask_jobqueue.{name}") from error
     made.scale(jobs=jobs)
     return made, jobs
+
+
+def _dask_jobqueue() -> Any:
+    """The package, without the handler of SIGINT that it installs: that ends the process with exit code 0."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        return import_module("dask_jobqueue")
+    finally:
+        if before is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
 
 
 def _do(parcel: Sequence[Task], limits: Limits) -> tuple[list[Ended], float]:

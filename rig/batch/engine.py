@@ -17,6 +17,7 @@ from typing import Any, Final, Literal, Protocol
 from rig.batch.store import FAILURES, Store, failure_files
 from rig.batch.task import Ended, Status, Task
 from rig.errors import UsageError
+from rig.interrupts import interrupts_ignored
 from rig.progress import Progress, tell_stage
 from rig.run_folder.disk import replace_file
 from rig.run_folder.plain_json import json_line
@@ -122,29 +123,25 @@ def run_batch(
     runs = _Runs(store, executor, [name for name in mine if name not in finished], retries)
     told = _Told(len(mine) - len(runs.waiting), len(mine), progress)
     aborted = False
+    ending = contextlib.ExitStack()
     try:
         for _ in runs.steps():
             told.tell(runs, executor)
     except KeyboardInterrupt:
+        # A second one, as `timeout` sends it and impatient people do, must not keep the table from being written.
+        ending.enter_context(interrupts_ignored())
         aborted = True
     finally:
-        try:
-            executor.close()
-        except KeyboardInterrupt:  # a second one, as `timeout` sends it and impatient people do
-            aborted = True
-        except Exception as error:  # the table is written all the same
-            _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
-        total, only = len(store.cases), shard[1] == 1
-        # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
-        there = set() if only else store.finished()
-        packed = only or (store.alone() and len(there := store.finished()) == total)
-        if packed:
+        with ending:
             try:
-                there = store.pack()
-            except OSError as error:
-                there, packed = store.finished(), False
-                runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
-        done = len(there)
+                executor.close()
+            except KeyboardInterrupt:
+                ending.enter_context(interrupts_ignored())
+                aborted = True
+            except Exception as error:  # the table is written all the same
+                _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
+            there, packed = _packed(store, runs, only=shard[1] == 1)
+        done, total = len(there), len(store.cases)
     for name in runs.done - there:
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
     failures = tuple(
@@ -173,6 +170,20 @@ def run_batch(
         done, total, len(runs.done), failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
         runs.most, tuple(executor.notes), packed,
     )  # fmt: skip
+
+
+def _packed(store: Store, runs: "_Runs", *, only: bool) -> tuple[set[str], bool]:
+    """Write the table, if no other shard is at work; returns the finished cases of all shards, and whether the table
+    has been written. only: whether there is no other shard."""
+    # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
+    there = set() if only else store.finished()
+    if only or (store.alone() and len(there := store.finished()) == len(store.cases)):
+        try:
+            return store.pack(), True
+        except OSError as error:
+            there = store.finished()
+            runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
+    return there, False
 
 
 def failure_line(failure: Mapping[str, Any]) -> str:
@@ -305,5 +316,6 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
         first = next(iter(runs.failed.values()))
         if first.status == "other code":
             raise UsageError("the program was changed while cases were tried; run the command again")
-        raise UsageError(f"case {first.name} fails: {first.message}")
+        setting = ", ".join(f"{name} {value}" for name, value in scratch.cases[first.name].labels.items())
+        raise UsageError(f"case {first.name} ({setting}) fails: {first.message}; `--case {first.name}` does it alone")
     return list(runs.times_s[1:] or runs.times_s)  # in the first one the process loads compiled code

@@ -3,8 +3,10 @@
 This is for cases whose computing time is a result. An error of a case is raised as it is, and ends the batch.
 """
 
+import logging
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rig.batch.case import Case, Result
@@ -12,7 +14,10 @@ from rig.batch.engine import run_batch
 from rig.batch.store import Store
 from rig.batch.task import Ended, Task, perform
 from rig.errors import UsageError
+from rig.interrupts import interrupts_ignored
 from rig.progress import Progress, part
+
+_log = logging.getLogger(__name__)
 
 
 class Here:
@@ -41,7 +46,8 @@ class Here:
         task, self._task = self._task, None
         assert task is not None, "called with a task under way"
         with part(f"{self._what} {self._begun} of {self._total}"):
-            return [perform(task, raises=True)]
+            # A file that changes meanwhile is read as it is: the command's own process has no other to agree with.
+            return [perform(replace(task, files={}), raises=True)]
 
     def close(self) -> None:
         """Forget the task that was taken."""
@@ -54,10 +60,19 @@ def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) 
     what: noun for a case, such as 'scan'. progress: called with the number of finished cases and of all.
 
     Returns the results in the order of the cases, and whether an interrupt ended it; those that are missing then are
-    None. Raises what a case raises, and UsageError if a file that a case reads has changed meanwhile.
+    None. Raises what a case raises. If there is no room for results, that is logged and ends it like an interrupt.
     """
-    with tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder, Store(Path(folder) / "all", cases) as store:
-        done = run_batch(store, Here(what, len(store.cases)), progress=progress)
-        if done.failures:
-            raise UsageError(f"{done.failures[0].message}; run the command again")
-        return store.results(), done.verdict == "aborted"
+    with tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder:
+        try:
+            store = Store(Path(folder) / "all", cases)
+        except UsageError as error:
+            if not isinstance(error.__cause__, OSError) or "cannot write" not in str(error):
+                raise
+            raise UsageError(f"no room for results in {tempfile.gettempdir()}; set TMPDIR to another folder") from error
+        with store:
+            done = run_batch(store, Here(what, len(store.cases)), progress=progress)
+            ended = done.verdict != "complete"
+            if done.reason:
+                _log.warning("%s", done.reason)
+            with interrupts_ignored(ended):
+                return store.results(), ended

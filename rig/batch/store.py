@@ -78,6 +78,7 @@ class Store:
         )
         self.head = {"schema": SCHEMA, "code": codes, "versions": numeric_versions(), **(title or {})}
         self._lock = -1
+        self._begun = False
         try:
             self._claim(lines, shared)
         except OSError as error:
@@ -111,7 +112,8 @@ class Store:
             raise UsageError(f"`out={folder}` has something else in it; name a new folder, or that of the same study")
         self._lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
         self._hold(shared)
-        if (folder / HEAD).exists():
+        self._begun = not (folder / HEAD).exists()
+        if not self._begun:
             self._require_same(lines)
         else:
             replace_file(folder / LIST, lines.encode())
@@ -119,6 +121,14 @@ class Store:
         (folder / CASES).mkdir(exist_ok=True)
         if shared:
             self._hold(shared, begun=True)
+
+    def give_up(self) -> None:
+        """Leave the folder as it was, if this store has begun it: the batch is refused before any case is done."""
+        if self._begun:
+            for name in (HEAD, LIST):
+                (self.folder / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # another shard has results
+                (self.folder / CASES).rmdir()
 
     def _hold(self, shared: bool, begun: bool = False) -> None:
         """Lock the folder. Raises UsageError if another process is at work in it.

@@ -1,5 +1,6 @@
 """Commands for this computer, and for many: `rig bench`, `warmup`, `batch`."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -120,7 +121,7 @@ def _show_batch(done: "BatchResult") -> None:
     if batch.reason:
         say(batch.reason)
     if batch.verdict == "aborted":
-        say("run the same command again to go on")
+        say(f"to go on, run the same command again, with --out {shlex.quote(str(done.folder))}")
     tell(f"files: {done.folder}")
 
 

@@ -31,7 +31,7 @@ WHOLE: Final[tuple[Action, ...]] = ("tradeoff", "strategies")
 """Actions whose lists are all combined in one table of their own."""
 OF_A_CASE: Final[Mapping[Action, tuple[str, ...]]] = {
     "tradeoff": ("scene", "fog", "exposures", "lines"),
-    "strategies": ("scene", "fog", "time", "rule"),
+    "strategies": ("scene", "fog", "time", "rule", "strategy"),
 }
 """Settings of such an action that tell its cases apart. Each case has all of the others, such as all estimators."""
 PATHS: Final = "config", "scene", "recording", "plan", "calibration"
@@ -124,6 +124,7 @@ class Study(BaseModel):
             for key, value in self.set.items()
             if isinstance(value, list) and "." not in key
         ]
+        problems += [f"{key} is under set and under vary; name it once" for key in self.set if key in self.vary]
         if self.do in WHOLE and self.also:
             problems.append(f"also is not for {self.do}, which combines all lists; add its values to vary")
         problems += self._problems_of_omit()

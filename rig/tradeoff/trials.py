@@ -141,7 +141,7 @@ def tabulate(
         if len(repeats) < asked.repeat:
             continue
         of_trial = list(map(over_repeats, zip(*repeats, strict=True)))
-        if asked.limits:
+        if asked.limits and verdict == "complete":  # who has interrupted wants to see what is there
             tell_stage("finding what the light allows")
             of_trial = limits.beside(of_trial, config)
         rows += of_trial

@@ -21,11 +21,13 @@ from rig.batch.store import Row, Store, read_failures, read_rows
 from rig.batch.task import HEAD
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
+from rig.interrupts import interrupts_ignored
 from rig.progress import Progress
 from rig.report.csv_file import csv_of
 from rig.requests import BatchRequest, StrategiesRequest, TradeoffRequest
 from rig.run_folder.disk import replace_file
 from rig.run_folder.folder import RunFolder
+from rig.run_folder.plain_json import json_line
 from rig.study.cases import cases_of, kept_cases
 from rig.study.definition import Study, load_study
 from rig.study.tables import lines_of, study_report
@@ -99,14 +101,20 @@ def batch(
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     folder = Path(request.out).absolute()
     with Store(folder, made.cases, {"study": loaded.model_dump(mode="json")}, shared=shard[1] > 1) as store:
-        executor = executor_of(request, store, limits, client)
+        try:
+            executor = executor_of(request, store, limits, client)
+        except BaseException:
+            store.give_up()
+            raise
         command = f"rig batch {_named(study)} --out {shlex.quote(str(request.out))}"
         done = run_batch(
             store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
         )  # fmt: skip
+        aborted = done.verdict == "aborted"
         if done.packed:
-            _write_tables(store, made, done.verdict == "aborted")
-    return BatchResult(done, folder)
+            with interrupts_ignored(aborted):
+                _write_tables(store, made, aborted)
+    return BatchResult(replace(done, notes=(*made.notes, *done.notes)), folder)
 
 
 def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes: Any) -> BatchPlan:
@@ -156,6 +164,23 @@ class _Made:
     cases: list[Case]
     write: Callable[[RunFolder, list[Result | None], bool], object] | None = None
     name: str = ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence on settings that mean the same, if there are some: they are one case."""
+        first: dict[str, Case] = {}
+        same = []
+        for case in self.cases:
+            meant = json_line({"function": case.function, "inputs": case.inputs})
+            if first.setdefault(meant, case) is not case:
+                same.append((case, first[meant]))
+        if not same:
+            return ()
+        words = [", ".join(f"{name} {value}" for name, value in each.labels.items()) for each in same[0]]
+        return (
+            f"{len(same)} of {len(self.cases)} combinations mean the same as another one, and are in the table once; "
+            f"the first is '{words[0]}', which is '{words[1]}'",
+        )
 
 
 def _made(study: Study) -> _Made:

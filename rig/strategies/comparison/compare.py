@@ -25,7 +25,7 @@ from rig.progress import tell_stage
 from rig.simd import Float32, Float64
 from rig.strategies.apparatus import Budget, Rule, Spent
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
-from rig.strategies.comparison.places import OWN, visibility_m
+from rig.strategies.comparison.places import OWN, scene_path, visibility_m
 from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
 from rig.strategies.comparison.score import Score, score
 from rig.strategies.strategy import GOOD, Answer, ColumnGeometry, Light, Strategy, TooShort, find_strategy
@@ -162,7 +162,7 @@ def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan)
     content = portable_content(config)
     cases = []
     for (name, scene), air in product(asked.scenes.items(), asked.airs):
-        file = str(Path(scene).absolute()) if Path(scene).exists() else scene
+        file = scene_path(scene)
         place = asdict(Place(name, file, air, asked.rows, asked.lux))
         files = files_of(content, file)
         for rule, time_s, way in product(asked.rules, asked.times_s, ways):

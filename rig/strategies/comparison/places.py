@@ -82,6 +82,12 @@ def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, 
     return file
 
 
+def scene_path(scene: str) -> str:
+    """The absolute path of a scene; a bundled name, or `ramp`, as it is."""
+    named = scene == RAMP or scene in {each.name for each in bundled_scenes()}
+    return scene if named else os.path.abspath(os.path.expanduser(scene))
+
+
 def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     bundled = {each.name: each.file for each in bundled_scenes()}
     path = bundled.get(scene, Path(os.path.expanduser(scene)))
@@ -99,6 +105,8 @@ def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     surfaces = content.get("surfaces", "street")
     if isinstance(surfaces, str) and surfaces not in ("street", "board"):
         content["surfaces"] = str((path.parent / surfaces).resolve())
+        if not os.path.exists(content["surfaces"]):
+            raise UsageError(f"scene {scene!r} names surfaces that are not there, {content['surfaces']}; correct it")
     return content
 
 

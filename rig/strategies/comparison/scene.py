@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.errors import DeviceError
-from rig.batch.case import checksum, files_of
+from rig.batch.case import current_checksum, files_of
 from rig.config.models import RigConfig
 from rig.config.overrides import configure
 from rig.errors import UsageError
@@ -52,10 +52,8 @@ class OpenScene:
     def __init__(self, config: RigConfig, place: Place) -> None:
         self.place = place
         model = rig_model(config)
-        with ExitStack() as stack:
-            file = scene_file(
-                place.scene, place.air, place.lux, model, Path(stack.enter_context(TemporaryDirectory()))
-            )  # fmt: skip
+        with ExitStack() as stack, TemporaryDirectory() as made:
+            file = scene_file(place.scene, place.air, place.lux, model, Path(made))
             self.config = configure(config, scene=str(file))
             scan = self.config.scan
             self._columns = scan.columns // LINES * LINES
@@ -99,7 +97,7 @@ def open_scene(config: Mapping[str, Any], place: Place) -> OpenScene:
 
     config: a config's content, with absolute paths.
     """
-    sums = {path: checksum(path) for path in files_of(config, place.scene)}
+    sums = {path: current_checksum(path) for path in files_of(config, place.scene)}
     key = json_line({"config": config, "place": asdict(place), "files": sums})
     if key not in _kept:
         close_scene()

@@ -202,6 +202,13 @@ def test_a_wrong_setting_has_its_name_in_the_study(rig: Rig, study: dict[str, An
     assert said in refused.problems[0]
 
 
+def test_settings_that_mean_the_same_are_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "executor_of", lambda *given: Inline(lambda task: Ended(task.name, "raised", "no")))
+    Path("study.yaml").write_text(yaml.safe_dump({**SCAN, "vary": {"fog": ["20m", "20m"]}, "repeat": 1}))
+    ran = rig("batch", "study.yaml", "--out", "study")
+    assert "1 of 2 combinations mean the same as another one, and are in the table once; the first is 'fog" in ran.err
+
+
 def test_an_interrupt_before_the_first_result_says_how_to_go_on(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(task: Any) -> None:
         raise KeyboardInterrupt
@@ -210,7 +217,7 @@ def test_an_interrupt_before_the_first_result_says_how_to_go_on(rig: Rig, monkey
     monkeypatch.setattr(batches, "executor_of", lambda *given: Inline(interrupt))
     ran = rig("batch", "study.yaml", "--out", "study")
     assert "aborted: 0 of 2 cases done" in ran.out
-    assert "run the same command again to go on" in ran.err
+    assert f"to go on, run the same command again, with --out {Path('study').absolute()}" in ran.err
     monkeypatch.setattr(batches, "executor_of", lambda *given: Inline())
     assert "complete: 2 of 2 cases done" in rig("batch", "study.yaml", "--out", "study").out
 

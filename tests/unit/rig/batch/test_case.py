@@ -6,7 +6,7 @@ import pytest
 
 from drivers.recorded.contents import INDEX_FILE
 from rig.batch import case as module
-from rig.batch.case import Case, call, changed_file, checksum, code_digest, package_of
+from rig.batch.case import Case, call, changed_file, checksum, code_digest, files_of, package_of
 from rig.errors import UsageError
 from tests.unit.rig.batch.executors import TINY
 
@@ -106,6 +106,14 @@ def test_whether_a_recording_has_changed_is_seen_without_a_look_at_all_its_files
     index.write_text("checksums of other blocks")
     assert changed_file(files) == str(tmp_path)
     assert changed_file({str(tmp_path / "gone"): "1"}) == str(tmp_path / "gone")
+
+
+def test_a_folder_with_the_name_of_a_scene_is_not_that_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "street").mkdir()
+    own = str(tmp_path / "street")
+    assert files_of({"world": {"scene": "street"}}) == files_of({}, "street") == ()
+    assert files_of({"world": {"scene": own}}) == files_of({}, own) == (own,)
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -269,6 +269,13 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
     assert asked == [2, 3]
 
 
+def test_the_package_for_batch_systems_does_not_take_interrupts_away(tmp_path: Path) -> None:
+    """Its import installs a handler that ends the process with exit code 0."""
+    said = "import signal; from rig.batch.cluster import _dask_jobqueue as get; get(); print(signal.getsignal(2))"
+    ran = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    assert "default_int_handler" in ran.stdout
+
+
 def test_a_batch_system_that_takes_no_job_ends_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     job = SimpleNamespace(job_id=None)
     queue = SimpleNamespace(worker_spec={"S-1": {}}, workers={"S-1": job}, scheduler_info={"workers": {}}, scale=None)

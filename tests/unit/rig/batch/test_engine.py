@@ -1,5 +1,7 @@
 """The engine runs each case until it has a result or has failed, and writes the table on every way out."""
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -203,6 +205,30 @@ def test_a_result_that_has_vanished_is_named(tmp_path: Path) -> None:
     assert (done.verdict, done.done) == ("failures", 1)
     assert {each.message for each in done.failures} == {"its result was written, but is not there any more"}
     assert run(tmp_path / "out", count=3).verdict == "complete"
+
+
+def test_a_second_interrupt_while_the_table_is_written_is_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(task: Task) -> None:
+        if len(executor.given) > 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def packing(self: Store) -> set[str]:
+        os.kill(os.getpid(), signal.SIGINT)
+        return pack(self)
+
+    pack = Store.pack
+    monkeypatch.setattr(Store, "pack", packing)
+    executor = Inline(interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # another test may have imported dask_jobqueue
+    try:
+        done = run(tmp_path / "out", executor)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (done.verdict, done.done) == ("aborted", 3)
+    assert len(table(tmp_path / "out").splitlines()) == 4
 
 
 def test_an_interrupt_keeps_a_whole_table_and_is_resumed(tmp_path: Path) -> None:

@@ -1,17 +1,20 @@
 """Cases in this process, one after the other: errors are raised as they are, and an interrupt keeps what is done."""
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from rig.batch.case import Case
+from rig.batch import store, task
 from rig.batch.here import do_here
+from rig.batch.task import write_once
 from rig.errors import UsageError
 from rig.progress import Step, listening
 from tests.unit.rig.batch import tiny
-from tests.unit.rig.batch.executors import TINY, squares
+from tests.unit.rig.batch.executors import squares
 
 
 def test_results_are_in_the_order_of_the_cases_and_each_says_which_it_is() -> None:
@@ -52,15 +55,22 @@ def test_an_interrupt_keeps_what_is_done(monkeypatch: pytest.MonkeyPatch) -> Non
     assert [result and result["y"] for result in found] == [0, 1, None, None]
 
 
-def test_a_file_that_changes_meanwhile_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "scene.yaml"
-    file.write_text("one")
+def test_no_room_for_results_keeps_what_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def writing(file: Path, text: str) -> None:
+        if len(written) == 2:
+            raise OSError(28, "No space left on device")
+        written.append(file)
+        write_once(file, text)
 
-    def square(x: int) -> Mapping[str, Any]:
-        file.write_text("another")
-        return {"y": x * x}
-
-    monkeypatch.setattr(tiny, "square", square)
-    cases = [Case(f"{TINY}:square", {"x": x}, {"x": x}, (str(file),)) for x in range(3)]
-    with pytest.raises(UsageError, match=r"scene\.yaml is not there any more as it was .*; run the command again"):
-        do_here(cases, "scan")
+    written: list[Path] = []
+    monkeypatch.setattr(task, "write_once", writing)
+    found, ended = do_here(squares(4), "scan")
+    assert ended
+    assert [result and result["y"] for result in found] == [0, 1, None, None]
+    assert "No space left on device" in caplog.text
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(store, "replace_file", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(UsageError, match=f"no room for results in {tmp_path}; set TMPDIR to another folder"):
+        do_here(squares(1), "scan")

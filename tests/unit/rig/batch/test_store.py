@@ -111,6 +111,18 @@ def test_a_folder_of_other_cases_is_refused(tmp_path: Path) -> None:
         Store(tmp_path / "out", labelled)
 
 
+def test_a_batch_that_is_refused_leaves_the_folder_to_others(tmp_path: Path) -> None:
+    """Its workers did not see a file, for example."""
+    with Store(tmp_path / "out", squares(3)) as store:
+        store.give_up()
+    with Store(tmp_path / "out", squares(2)) as store:
+        do(store, store.names)
+        store.pack()
+    with Store(tmp_path / "out", squares(2)) as store:
+        store.give_up()
+        assert len(list(store.rows())) == 2
+
+
 def test_changed_contents_of_an_input_are_other_cases(tmp_path: Path) -> None:
     (tmp_path / "input").write_text("1")
     cases = [Case(f"{TINY}:square", {"x": 1}, files=(str(tmp_path / "input"),))]

@@ -29,7 +29,7 @@ from rig.strategies.comparison.compare import (
     run_comparison,
 )
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
-from rig.strategies.comparison.places import air_problems, scene_file, visibility_m
+from rig.strategies.comparison.places import air_problems, scene_file, scene_path, visibility_m
 from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
@@ -135,6 +135,24 @@ def test_scenes_of_the_same_name_are_told_apart_and_cases_are_the_parts_of_a_com
     cases, _ = as_cases(config, request)
     parts = [StrategyRow(**row) for case in cases for row in case.call()["rows"]]
     assert parts == [replace(row, compute_s=0.0) for row in whole.rows]
+
+
+def test_a_folder_with_the_name_of_a_scene_is_not_that_scene_and_nothing_is_left_behind(config, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "ramp").mkdir()
+    assert scene_path("ramp") == "ramp"
+    assert scene_path("own") == str(tmp_path / "own")
+    place = Place("ramp", "ramp", "clear", 4, None)
+    assert open_scene(portable_content(configure(config)), place).true_m.size
+    assert [each.name for each in tmp_path.iterdir()] == ["ramp"]
+    close_scene()
+
+
+def test_a_scene_whose_surfaces_are_missing_is_told_before_anything_is_measured(config, tmp_path):
+    (tmp_path / "bad.yaml").write_text("surfaces: nowhere\n")
+    with pytest.raises(UsageError, match=r"bad\.yaml' names surfaces that are not there, .*nowhere; correct it"):
+        compare_strategies(config, **SOME | {"scenes": ["ramp", str(tmp_path / "bad.yaml")]})
 
 
 def test_a_scene_stays_open_until_another_is_wanted_or_its_files_have_changed(config, tmp_path):

@@ -49,8 +49,12 @@ def problems_of(content: dict[str, Any]) -> list[str]:
             "study: omit has fog '20 m', which no case has; fog is one of ['20m']",
         ),
         (
-            {"do": "strategies", "omit": [{"strategy": "gray-spad"}]},
-            "study: omit has 'strategy', but every case of strategies has all of them; make two studies",
+            {"do": "tradeoff", "omit": [{"estimator": "edge"}]},
+            "study: omit has 'estimator', but every case of tradeoff has all of them; make two studies",
+        ),
+        (
+            {"do": "scan", "set": {"fog": "9m"}, "vary": {"fog": ["10m"]}},
+            "study: fog is under set and under vary; name it once",
         ),
         ({"do": "scan", "repeat": MOST_CASES + 1}, f"{MOST_CASES + 1} cases are too many, at most {MOST_CASES}"),
     ],
