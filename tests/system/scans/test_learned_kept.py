@@ -53,7 +53,7 @@ def test_what_does_not_explain_the_first_map_is_learned_anew(tmp_path: Path) -> 
 
 
 def test_a_halo_is_kept_with_its_medium(tmp_path: Path) -> None:
-    rig, kept = api.configure(scene="street-dense-fog", exposures=10), tmp_path / "learned.npz"
+    rig, kept = api.configure(write_rig(tmp_path), scene="street-dense-fog", exposures=20), tmp_path / "learned.npz"
     api.scan(rig, seed=1, estimator="joint", learned=kept)
     state = np.load(kept)
     assert state["halo"].any()
