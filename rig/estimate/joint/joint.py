@@ -53,7 +53,8 @@ START_BELIEF = 0.1
 """Belief in the medium learned row by row, which knows no halo, when lessons begin again by contrast: it only decides
 between places that look alike."""
 LOST = 0.2
-"""If a smaller share of answers teaches the last lesson in fog, light scattered many times may hide the stripes."""
+"""If a smaller share of answers teaches one of the lessons in fog, light scattered many times may hide the stripes. The
+next lesson may have many that agree on a wrong place."""
 
 
 class Joint:
@@ -157,6 +158,7 @@ class Joint:
             if kept is not None:
                 return kept
         witness_px, lessons, intensity, misled = None, 0, volume.intensity(self._workers), model
+        fewest = 1.0  # share of answers that taught a lesson
         foggy = bool(model.profile[:, 0].max() > np.median(model.ambient))
         while lessons < (LESSONS if witness_px is None else HALO_LESSONS):
             (taught, teaching, error), lessons = (
@@ -165,7 +167,8 @@ class Joint:
             if witness_px is not None and model.halo.any() and taught.halo.any() and taught.belief < model.belief:
                 break  # a lesson that explains less of the counts has learned from wrong stripes
             model = taught
-            lost = foggy and lessons == LESSONS and (teaching < LOST or error > MISLED)
+            fewest = min(fewest, teaching)
+            lost = foggy and lessons == LESSONS and (fewest < LOST or error > MISLED)
             if witness_px is None and (model.halo.any() or lost):
                 # Light scattered many times may have misled these lessons: they found a halo, or too few stripes to
                 # find one. Begin again, and check stripes by contrast.

@@ -59,6 +59,29 @@ def test_columns_without_frames_have_no_answer_and_those_beside_them_do():
     assert np.mean(np.abs(found.x_px - sweep.point.x_true)[scored] <= 1) > 0.85
 
 
+@pytest.mark.parametrize(
+    ("light", "shares", "error", "again"),
+    [
+        ("dense", (0.03, 0.43), 0.1, True),  # answers that agree on a wrong place
+        ("dense", (0.43, 0.03), 0.1, True),
+        ("dense", (0.3, 0.4), 0.1, False),
+        ("dense", (0.3, 0.4), 0.3, True),
+        ("clear", (0.03, 0.43), 0.3, False),
+    ],
+)
+def test_lessons_begin_again_by_contrast_if_fog_may_have_hidden_the_stripes(monkeypatch, light, shares, error, again):
+    given, alone = [*shares, 0.5, 0.5, 0.5], []
+
+    def taught(self, volume, intensity, geometry, model, witness_px):
+        return model, given.pop(0), error
+
+    monkeypatch.setattr(Joint, "_taught", taught)
+    monkeypatch.setattr(solver.MapSolver, "by_contrast", lambda *_: alone.append(True) or np.zeros(1))
+    sweep = simulated(light, 3)
+    Joint(1).estimate(sweep.volume, sweep.geometry)
+    assert bool(alone) == again
+
+
 LIMITS = {("report", 3, "turned"): 0.3, ("dense", 10, "left"): 0.4, ("clear", 3, "left"): 0.3}
 """Mean error in px, cut off at 10, that so few rows and columns allow."""
 
