@@ -244,13 +244,13 @@ def open_device(
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
     """The one device that an address means. Errors as in `open_device`, except for those of claiming it."""
+    key, _, value = address.removeprefix("usb:").partition("=")
+    if address != "usb" and not (address.startswith("usb:") and key in ("serial", "path") and value):
+        raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
     listings = attached(wanted, backend)
     ids = f"{wanted.vendor:04x}:{wanted.product:04x}"
     if not listings:
         raise DeviceNotFound(f"{wanted.label}: no USB device {ids} is attached; plug it in and switch it on")
-    key, _, value = address.removeprefix("usb:").partition("=")
-    if address != "usb" and not (address.startswith("usb:") and key in ("serial", "path") and value):
-        raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
     chosen = [one for one in listings if address == "usb" or getattr(one, key) == value]
     choices = ", ".join(one.address for one in listings)
     if not chosen:

@@ -126,6 +126,12 @@ def test_the_wrong_firmware_is_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("address", ["/dev/ttyUSB0", "usb:serail=1", "usb:serial="])
+def test_an_address_that_is_none_is_said_also_if_nothing_is_attached(address: str) -> None:
+    with pytest.raises(DeviceError, match=f"port '{address}' is no USB address; write usb, usb:serial=ABC or"):
+        SpbUsb.open(address)
+
+
 def test_a_flipped_bit_in_an_answer_without_a_checksum_is_noticed() -> None:
     class Flipping(SpbUsbModel):
         left = 0
