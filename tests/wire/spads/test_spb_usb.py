@@ -21,6 +21,7 @@ from drivers.errors import (
 )
 from drivers.frames import BlockFlag, Mark
 from drivers.interfaces import WindowTable
+from drivers.spads.spb_usb import SpbUsb
 from drivers.spb1.control import Ack, AckStatus, Command, Feature, Op, Register, SensorState, pattern_row, read_acks
 from sim_backend.wire.firmware.spb_usb import SpbUsbModel
 from sim_backend.wire.firmware.spb_usb_run import SpbUsbBoard
