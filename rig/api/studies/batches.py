@@ -191,9 +191,12 @@ def _made(study: Study) -> _Made:
 
 
 def _in_settings(text: str) -> str:
-    """A problem that names an argument, `times`, with the name that it has in a study: time."""
+    """A problem that names an argument, `times`, or its value, `exposures=10`, with what a study has: time, or
+    exposures: 10."""
     names = {field: setting for setting, field in _FIELDS.items()}
-    return re.sub("`([a-z_]+)`", lambda found: names.get(found[1], found[1]), text)
+    text = re.sub("`([a-z_]+)`", lambda found: names.get(found[1], found[1]), text)
+    text = re.sub("`([a-z_]+)=([^`]*)`", lambda found: f"'{names.get(found[1], found[1])}: {found[2]}'", text)
+    return text.removeprefix("option: ")
 
 
 def _cases_and_table(study: Study) -> _Made:

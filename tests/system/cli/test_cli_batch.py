@@ -202,6 +202,15 @@ def test_a_wrong_setting_has_its_name_in_the_study(rig: Rig, study: dict[str, An
     assert said in refused.problems[0]
 
 
+def test_problems_of_settings_name_no_options_of_the_command_line(rig: Rig) -> None:
+    wrong = {"do": "scan", "set": {"config": "small", "exposures": -3, "scan.colums": 4}}
+    Path("study.yaml").write_text(yaml.safe_dump(wrong))
+    assert rig("batch", "study.yaml", "--out", "study").problems == [
+        "error: unknown key 'scan.colums'; did you mean 'columns'?",
+        "error: exposures is -3, it must be at least 1; write for example 'exposures: 10'",
+    ]
+
+
 def test_settings_that_mean_the_same_are_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "executor_of", lambda *given: Inline(lambda task: Ended(task.name, "raised", "no")))
     Path("study.yaml").write_text(yaml.safe_dump({**SCAN, "vary": {"fog": ["20m", "20m"]}, "repeat": 1}))
