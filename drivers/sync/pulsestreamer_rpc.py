@@ -141,7 +141,7 @@ class JsonRpc:
             f"POST /json-rpc HTTP/1.1\r\nHost: {self._peer[0]}:{self._peer[1]}\r\nConnection: close\r\n"
             f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
         )
-        patience = _Patience(within_s)
+        patience, begun_s = _Patience(within_s), time.monotonic()
         while True:
             reached = False
             try:
@@ -164,7 +164,8 @@ class JsonRpc:
             except OSError as error:
                 # Before the connection stands, any error may pass: also that there is no route to the box.
                 again = not reached or (isinstance(error, ConnectionError) and method.startswith(_REPEATABLE))
-                patience.left_s -= _RETRY_PAUSE_S
+                # Unlike silence, an error has an end that this computer has seen: all the time until then counts.
+                patience.left_s = min(patience.left_s - _RETRY_PAUSE_S, within_s - (time.monotonic() - begun_s))
                 if not again or patience.left_s < max(within_s - retry_s, 0):
                     raise DeviceDisconnected(
                         f"{self._name} cannot be reached at {self._address} ({one_line(error)}); check its power, its "
