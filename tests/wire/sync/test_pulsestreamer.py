@@ -605,6 +605,28 @@ def test_the_box_is_asked_often_only_when_something_is_due() -> None:
         assert count.pause_s(asked_s + 0.1) == pause_s
 
 
+def test_a_box_that_refuses_is_not_asked_for_longer_on_a_busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pause of 5 ms takes 0.1 s here."""
+
+    class Busy:
+        now_s = 0.0
+
+        def monotonic(self) -> float:
+            return self.now_s
+
+        def sleep(self, time_s: float) -> None:
+            self.now_s += 0.1
+
+    busy = Busy()
+    with socket.socket() as server:  # bound, but it does not listen: connections are refused
+        server.bind(("127.0.0.1", 0))
+        rpc = JsonRpc("box", f"127.0.0.1:{server.getsockname()[1]}", None, 1.0)
+        monkeypatch.setattr(pulsestreamer_rpc, "time", busy)
+        with pytest.raises(DeviceDisconnected, match="refused"):
+            rpc.ask("isStreaming", 0.3)
+    assert 0.2 < busy.now_s < 0.5
+
+
 def test_a_box_that_was_out_of_reach_is_taken_low_when_the_network_is_back() -> None:
     with pulse_box() as box, box.open() as device:
         device.program(SWEEP, 3)
