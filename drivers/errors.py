@@ -42,6 +42,10 @@ class DeviceFault(DeviceError):
     """Raised when a device reports a fault of its own, or does something else than it was told."""
 
 
+class EmergencyStop(DeviceFault):
+    """Raised when a device stays in emergency stop: somebody holds its stop input."""
+
+
 class InterlockOpen(DeviceError):
     """Raised when the interlock of a laser that is armed, or is to be armed, is open."""
 

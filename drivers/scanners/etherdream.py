@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from drivers.clock import Clock, SystemClock, now_s
-from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceNotFound
+from drivers.errors import DeviceBusy, DeviceDisconnected, DeviceError, DeviceFault, DeviceNotFound, EmergencyStop
 from drivers.interfaces import ScannerStatus
 from drivers.registry import Kind, Surroundings, config_of
 from drivers.scanners.dac_scanner import PATIENCE_S, POLL_S, DacRun, DacScanner, PointSource
@@ -56,10 +56,6 @@ later."""
 _HOLD_POLL_S = 0.02
 _HARDWARE_KNOWN = (0, 1, 2, 10)
 """Hardware revisions of the first generation, and of the Ether Dream 2 that was measured."""
-
-
-class Stopped(DeviceFault):
-    """The board stays in emergency stop."""
 
 
 class EtherDreamConfig(GalvoConfig):
@@ -208,7 +204,7 @@ class EtherDreamDac:
         """Leave the emergency stop. Raises `DeviceFault` if its cause persists."""
         reply: Reply = self._line.ask(CLEAR)
         if reply.code == STILL_STOPPED or reply.light_engine != READY or reply.playback != IDLE:
-            raise Stopped(
+            raise EmergencyStop(
                 f"{self.name}: stays in emergency stop (state {reply.light_engine}); release its stop input, then "
                 "start again"
             )
@@ -306,7 +302,7 @@ class EtherDream(DacScanner):
     def _make_safe(self) -> None:
         try:
             super()._make_safe()
-        except Stopped as error:  # somebody holds its stop input: it is dark, with the mirror at the centre
+        except EmergencyStop as error:  # somebody holds its stop input: it is dark, with the mirror at the centre
             _log.warning("%s", error)
 
     def _rest(self) -> float:

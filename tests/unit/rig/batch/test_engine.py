@@ -11,7 +11,7 @@ from rig.batch import engine as module
 from rig.batch.case import Case
 from rig.batch.engine import LOST, Batch, in_words, probe, run_batch
 from rig.batch.store import Store, read_failures
-from rig.batch.task import Ended, Status, Task, result_file
+from rig.batch.task import Ended, Status, Task
 from rig.errors import RigError, UsageError
 from rig.progress import Step, listening
 from tests.unit.rig.batch.executors import TINY, Inline, squares, troubles
@@ -343,7 +343,7 @@ def test_a_probe_tries_a_few_cases_spread_over_the_batch(tmp_path: Path) -> None
     with Store(tmp_path / "out", squares(90)) as store:
         assert len(probe(store, executor)) == 2, "the first one loads compiled code"
         assert sorted(store.names.index(name) // 30 for name in executor.given) == [0, 1, 2]
-        assert not result_file(tmp_path / "out", store.names[0]).exists()
+        assert len(store.finished()) == 3
     assert executor.closed
     with Store(tmp_path / "bad", squares(2)) as store, pytest.raises(UsageError, match=r"case .* fails: it raised"):
         probe(store, Inline(ends("raised")))
