@@ -1,5 +1,6 @@
 """One run of an emulated SPB1 device, its USB descriptors and its registers (docs/reference/spb1-usb.md)."""
 
+import struct
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,6 +81,10 @@ class SpbUsbBoard:
     max_stride: int = 1 << 20
     link_bytes_per_s: int = 400_000_000
     """Rate that the link carries, as the board states it."""
+    speed: Literal["high", "super"] = "super"
+    """Speed of the bus; `high` behind a USB 2 cable or hub. Both chips then have packets of 512 bytes."""
+    zero_packets: bool = False
+    """Test knob: whether the FPGA ends each block with a packet of 0 bytes, which ends the host's read."""
     protocol: int = 0x0100
     """Version of SPB1 that it speaks: major << 8 | minor."""
     features: Feature = ~Feature.EXTERNAL_TRIGGER
@@ -260,7 +265,10 @@ def _window(registers: Mapping[int, int]) -> WindowTable | None:
     return WindowTable(width, tuple(tables))
 
 
-_PACKET = 1024
+_PACKET = {"high": 512, "super": 1024}
+CHIP_BYTES: Final[Mapping[Chip, int]] = {"fx3": 8 * 16 * 1024, "ft601": 16 * 1024}
+"""Most bytes that the USB chip itself holds for the host. FX3: 8 DMA buffers of 16 KiB (AN65974's firmware); FT601: its
+whole FIFO memory. The FPGA cannot take them back."""
 WINDOW_ENTRIES: Final = 4096
 """Most entries of all window tables together."""
 WRITABLE: Final = frozenset(
@@ -272,17 +280,36 @@ WRITABLE: Final = frozenset(
 )
 
 
-def device_spec(chip: Chip, acks: str, serial: str | None, product_name: str) -> DeviceSpec:
+def device_spec(board: SpbUsbBoard) -> DeviceSpec:
     """The USB descriptors. FX3: 04B4:00F1, one interface. FT601: 0403:601F, interface 0 for its session, interface 1
-    for data.
+    for data; each of its channels has both directions.
     """
-    addresses = ((0x01, 0x81, 0x82) if chip == "fx3" else (0x02, 0x82, 0x83))[: 3 if acks == "endpoint" else 2]
-    bulk = tuple(EndpointSpec(address, "bulk", _PACKET) for address in addresses)
-    if chip == "fx3":
-        return DeviceSpec(0x04B4, 0x00F1, "spadrig", product_name, serial, "super", (AlternateSpec(0, 0, bulk),))
-    session = (EndpointSpec(0x01, "bulk", _PACKET), EndpointSpec(0x81, "interrupt", 64, 1))
-    alternates = (AlternateSpec(0, 0, session), AlternateSpec(1, 0, bulk))
-    return DeviceSpec(0x0403, 0x601F, "FTDI", product_name, serial, "super", alternates)
+    two, serial, packet = board.acks == "endpoint", board.serial, _PACKET[board.speed]
+    addresses = (0x01, 0x81, 0x82) if board.chip == "fx3" else (0x02, 0x82, 0x03, 0x83)
+    bulk = tuple(EndpointSpec(address, "bulk", packet) for address in addresses[: None if two else 2])
+    if board.chip == "fx3":
+        alternates = (AlternateSpec(0, 0, bulk),)
+        return DeviceSpec(0x04B4, 0x00F1, "spadrig", board.product_name, serial, board.speed, alternates)
+    session = (EndpointSpec(0x01, "bulk", packet), EndpointSpec(0x81, "interrupt", 64, 1))
+    interfaces = (AlternateSpec(0, 0, session), AlternateSpec(1, 0, bulk))
+    return DeviceSpec(0x0403, 0x601F, "FTDI", board.product_name, serial, board.speed, interfaces)
+
+
+_FT601_CONFIG = struct.Struct("<HH128sBBHBBBBHBBII")
+
+
+def ft601_config(board: SpbUsbBoard) -> bytes:
+    """The FT601's configuration, 152 bytes, as FT_60XCONFIGURATION in ftd3xx.h has it. One channel: FT245 mode, two:
+    FT600 mode.
+    """
+    strings = ("FTDI", board.product_name, board.serial or "")
+    texts = b"".join(bytes((2 + 2 * len(text), 3)) + text.encode("utf-16-le") for text in strings)
+    two = board.acks == "endpoint"
+    no_cancel_on_underrun = 2
+    return _FT601_CONFIG.pack(
+        *(0x0403, 0x601F, texts.ljust(128, b"\0"), 0, 0xE0, 0x60),
+        *(0, 0, 1 if two else 0, 1 if two else 2, no_cancel_on_underrun, 0xE4, 0, 0x10800, 0),
+    )
 
 
 def registers_at_power_up(board: SpbUsbBoard) -> dict[int, int]:

@@ -185,6 +185,10 @@ class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries n
         """End a stall."""
         dev_handle.device.clear_halt(ep)
 
+    def reset_device(self, dev_handle: _Handle) -> None:
+        """Reset the device's port."""
+        dev_handle.device.reset()
+
     def _until(self, timeout_ms: int) -> Iterator[None]:
         """Yield for each attempt until the timeout is over, at least once. Raises ValueError for a timeout of 0."""
         if timeout_ms <= 0:

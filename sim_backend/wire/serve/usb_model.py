@@ -105,7 +105,8 @@ class DeviceSpec:
         return bytes((2 + len(text), STRING)) + text
 
 
-_GET_STATUS, _GET_DESCRIPTOR, _GET_CONFIGURATION, _GET_INTERFACE = 0, 6, 8, 10
+_GET_STATUS, _CLEAR_FEATURE, _GET_DESCRIPTOR, _GET_CONFIGURATION, _GET_INTERFACE = 0, 1, 6, 8, 10
+_TO_ENDPOINT, _ENDPOINT_HALT = 0x02, 0
 
 
 class Stall(Enum):
@@ -162,6 +163,12 @@ class UsbModel:
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
         """Note that the host chose an alternate setting. It is 0 also when the host released the interface or died."""
+
+    def halt_cleared(self, endpoint: int, now_s: float) -> None:
+        """Note that the host cleared a halt, which it may do without any halt before (USB 2.0, 9.4.5)."""
+
+    def configured(self, now_s: float) -> None:
+        """Note that the host chose the configuration: by SET_CONFIGURATION, or after a reset of the port."""
 
     def control(self, setup: Setup, data: bytes, now_s: float) -> Answer:
         """Answer a class or vendor request: the reply for IN, b"" ('taken') for OUT, None while not ready, or STALL."""
@@ -237,6 +244,15 @@ class AttachedDevice:
             self.configuration = value
             self._alternates.clear()
             self._halted.clear()
+            self.model.configured(self._now())
+
+    def reset(self) -> None:
+        """Reset the port: the host then chooses the configuration again. libusb claims its interfaces again."""
+        with self._alive():
+            self.configuration = 1
+            self._alternates.clear()
+            self._halted.clear()
+            self.model.configured(self._now())
 
     def claim(self, interface: int, owner: object) -> None:
         """Claim an interface. Raises EBUSY if another owner holds it, ENOENT for an unknown one."""
@@ -267,6 +283,7 @@ class AttachedDevice:
         """End a stall."""
         with self._alive():
             self._halted.discard(endpoint)
+            self.model.halt_cleared(endpoint, self._now())
 
     def control(self, setup: Setup, data: bytes) -> bytes | None:
         """Make a control transfer. Returns the reply (b"" for OUT), or None while the device is not ready."""
@@ -351,6 +368,9 @@ class AttachedDevice:
         """The requests of USB 2.0 chapter 9 that a host sends outside of enumeration."""
         if setup.request == _GET_DESCRIPTOR:
             return self._descriptor(setup.value >> 8, setup.value & 0xFF)
+        if setup.request == _CLEAR_FEATURE and setup.request_type == _TO_ENDPOINT and setup.value == _ENDPOINT_HALT:
+            self.clear_halt(setup.index)
+            return b""
         if setup.request == _GET_STATUS:
             return b"\0\0"
         if setup.request == _GET_CONFIGURATION:

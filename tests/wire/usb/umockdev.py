@@ -54,6 +54,7 @@ class _Call(IntEnum):
     REAPURBNDELAY = 0x4008550D
     CLAIMINTERFACE = 0x8004550F
     RELEASEINTERFACE = 0x80045510
+    RESET = 0x5514
     CLEAR_HALT = 0x80045515
     GET_CAPABILITIES = 0x8004551A
     GET_SPEED = 0x551F
@@ -178,8 +179,12 @@ class UsbFile:
                 value = self._number(argument)
                 self._device.set_configuration(value)
                 self._served.configured(value)
-            case _Call.CLEAR_HALT | _Call.RESETEP:
+            case _Call.CLEAR_HALT:
                 self._device.clear_halt(self._number(argument))
+            case _Call.RESETEP:
+                pass  # resets the host's side only: the device is not told
+            case _Call.RESET:
+                self._device.reset()
             case _Call.GET_CAPABILITIES:
                 self._poke(argument, struct.pack("=I", _CAN))
             case _Call.GET_SPEED:
