@@ -62,10 +62,12 @@ class SpbUsbModel(UsbModel):
 
     def halt_cleared(self, endpoint: int, now_s: float) -> None:
         """Drop what the FX3 holds for this endpoint: its firmware resets the DMA channel and flushes the endpoint
-        (FX3 SDK, cyfxslfifosync.c:408-433). What an FT601 does is not known: here, nothing.
+        (FX3 SDK, cyfxslfifosync.c:408-433). The FT601 sends no more (LimeSuite issue 254): here, its session ends.
         """
         if self.chip == "fx3":
             self._drop_chip(endpoint, now_s)
+        else:
+            self._sessions.pop(endpoint, None)
 
     def configured(self, now_s: float) -> None:
         """Drop what the FX3 holds: SET_CONFIGURATION restarts its DMA channels (FX3 SDK, cyfxslfifosync.c:449-457). The
