@@ -91,7 +91,8 @@ class SpbUsbModel(UsbModel):
         if self.deaf:
             return len(data)
         if self.chip == "ft601" and endpoint == 0x01:
-            return self._session(data, now_s)
+            self._now_s = now_s
+            return self._session(data)
         if endpoint != (0x01 if self.chip == "fx3" else 0x02):
             return len(data)  # OUT of the FT601's second channel: the board has no use for it
         for at in range(0, len(data) - len(data) % COMMAND.size, COMMAND.size):
@@ -122,7 +123,7 @@ class SpbUsbModel(UsbModel):
             self._sessions[endpoint] = allowed - len(piece[:length])
         return piece[:length]
 
-    def _session(self, data: bytes, now_s: float) -> int:
+    def _session(self, data: bytes) -> int:
         """Obey a session command for one IN pipe: 0 ends its session, 1 lets it send `length` bytes, 2 lets it stream
         (ft60x.c:276-293, 453-470; ft60x-rs), 3 drops what the chip holds for it, and no more than that: openft60x calls
         it 'flush', and ft60x-rs notes that alone it does not end a stream. OUT pipes need no session.
@@ -136,7 +137,7 @@ class SpbUsbModel(UsbModel):
             elif command in (1, 2):
                 self._sessions[pipe] = length if command == 1 else math.inf
             elif command == 3:
-                self._drop_chip(pipe, now_s)
+                self._drop_chip(pipe, self._now_s)
         return len(data)
 
     # What the USB chip holds
