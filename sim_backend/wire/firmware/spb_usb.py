@@ -48,6 +48,8 @@ class SpbUsbModel(UsbModel):
         self._board = board
         self.state = SensorState.IDLE
         self._run: EmulatedRun | None = None
+        self._run_id = self._exposed = 0
+        self._now_s = 0.0
         self._acks: deque[bytes] = deque()
         self._queue: deque[memoryview] = deque()
         self._memory = BlockMemory()
