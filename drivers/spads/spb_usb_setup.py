@@ -224,13 +224,14 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """For an FT601: clear what an unclosed session left behind, then let it stream. May raise `ProtocolError`."""
+        """For an FT601: clear what an unclosed session left behind, then let it stream, each by the two commands that
+        public clients send for it. May raise `ProtocolError`."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
         if found != _CONFIG_BYTES:
             raise ProtocolError(f"{link.label}: an FT601 has {_CONFIG_BYTES} bytes of configuration, not {found}")
-        for command in (_CLEAR, _STREAM):
+        for command in (_ABORT, _CLEAR, _ABORT, _STREAM):
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
@@ -240,7 +241,8 @@ class Wiring:
                 self._tell(link, command)
 
     def _tell(self, link: BulkLink, command: int) -> None:
-        """Send a command to the pipes in use. On others it disturbs the session (LeechCore pull requests 80, 81)."""
+        """Send a command to the pipes in use. Some say that on others it disturbs the session (LeechCore pull request
+        81)."""
         for pipe in sorted({self.stream_in, self.ack_in} & link.endpoints):
             length = _STREAM_BYTES if command == _STREAM else 0
             link.write(_SESSION_OUT, _COMMAND.pack(0, pipe, command, 0, length, 0, 0), 1.0)

@@ -111,7 +111,7 @@ class BlockReceiver:
         if reaped is None:
             return ReadOutcome.NOTHING
         item = self._items.popleft()
-        if not item.use:
+        if not item.use or not reaped[1]:  # a packet of 0 bytes is no block, only the end of a transfer
             self._give_back(item)
             return ReadOutcome.CONTROL
         return self._judge(item, item.buffer[: reaped[1]])

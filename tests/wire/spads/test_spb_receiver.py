@@ -61,8 +61,11 @@ def truncated(block: bytearray) -> tuple[bytes]:
     ],
 )
 @pytest.mark.parametrize("number", [3, 9])
-def test_damage_of_a_block_costs_that_block_only(number: int, change: Change, lost: int, refused: int) -> None:
-    device = model()
+@pytest.mark.parametrize("zero_packets", [False, True], ids=["", "packets of 0 bytes"])
+def test_damage_of_a_block_costs_that_block_only(
+    number: int, change: Change, lost: int, refused: int, zero_packets: bool
+) -> None:
+    device = model(zero_packets=zero_packets)
     with opened(device) as spad:
         device.mangle = nth(number, change)
         begun_s = now_s(spad._clock)

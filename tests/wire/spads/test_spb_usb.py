@@ -65,7 +65,8 @@ def test_golden_bytes_of_commands_and_acknowledgements() -> None:
 
 
 def test_golden_bytes_of_the_ft601_session_which_leaves_pipes_not_in_use_alone() -> None:
-    # u32 index, u8 pipe, u8 command, u16 0, u32 length, u32 0, u32 0: clear, then stream; abort, then clear at the end
+    # u32 index, u8 pipe, u8 command, u16 0, u32 length, u32 0, u32 0:
+    # abort, clear, abort, stream; at the end abort, clear
     seen: list[bytes] = []
 
     class Spy(SpbUsbModel):
@@ -75,7 +76,7 @@ def test_golden_bytes_of_the_ft601_session_which_leaves_pipes_not_in_use_alone()
 
     opened(Spy(NumberedSource(), SpbUsbBoard(WIDTH, HEIGHT, chip="ft601", acks="stream"))).close()
     head = [data[:6].hex(" ") for data in seen]
-    assert head == ["00 00 00 00 82 03", "00 00 00 00 82 02", "00 00 00 00 82 00", "00 00 00 00 82 03"]
+    assert head == [f"00 00 00 00 82 {command}" for command in ("00", "03", "00", "02", "00", "03")]
     assert all(len(data) == 20 for data in seen)
 
 
