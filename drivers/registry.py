@@ -91,6 +91,8 @@ def config_of(kind: type[Config], **fields: object) -> Config:
             if value is not None:
                 fields[name] = _quantity(key, value, dimension)
                 given[name] = f"{key} = {value!r}"
+        elif key in fields and fields[key] is None:
+            del fields[key]
         elif key in fields and not isinstance(fields[key], str):
             fields[name] = _quantity(key, fields[key], dimension)
     try:

@@ -18,8 +18,10 @@ def interrupts_ignored(when: bool = True) -> Iterator[None]:
         yield
         return
     numbers = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    before = {number: handler for number in numbers if (handler := signal.getsignal(number)) is not None}
     try:
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
         yield
     finally:
         for number, handler in before.items():

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import GONE, DeviceDisconnected, DeviceError, DeviceFault
 from drivers.interfaces import BeamScanner, ScannerLimits, ScannerStatus, ScanWaveform
+from drivers.interfaces.forgotten import watch_for_end
 from drivers.scanners.galvo import GalvoConfig, brake, ramp
 from drivers.transports.endpoints import Endpoint
 from drivers.transports.tap import Tap
@@ -247,7 +249,7 @@ class DacScanner(BeamScanner):
         self._limits = config.limits(dac.highest_rate_hz)
         self._loaded: tuple[ScanWaveform, int] | None = None
         self._motion = _Motion(dac.name)
-        self._forgotten = weakref.finalize(self, _forgotten, self._motion, dac, os.getpid())
+        self._forgotten = watch_for_end(self, partial(_end, self._motion, dac, os.getpid()))
 
     @property
     def identity(self) -> str:
@@ -266,7 +268,8 @@ class DacScanner(BeamScanner):
 
     def _do_status(self) -> ScannerStatus:
         motion = self._motion
-        moving = motion.thread is not None and motion.thread.is_alive()
+        thread = motion.thread
+        moving = thread is not None and thread.is_alive()
         if isinstance(motion.error, DeviceDisconnected):
             raise motion.error
         if not moving and motion.error is None:
@@ -306,7 +309,6 @@ class DacScanner(BeamScanner):
             super()._make_safe()
 
     def _do_close(self) -> None:
-        self._forgotten.detach()
         self._motion.stopping.set()
         self._motion.join()  # no other thread may talk to the board while it is closed
         try:
@@ -314,6 +316,7 @@ class DacScanner(BeamScanner):
                 if self._motion.position is not None:
                     self._go(0.0)
             finally:
+                self._forgotten.detach()
                 self._dac.close()
         except GONE as error:
             self._lost_at_close(error)
@@ -367,13 +370,12 @@ def _feed(run: DacRun, motion: _Motion, of: "weakref.ref[DacScanner]") -> None:
         run.give_up()
 
 
-def _forgotten(motion: _Motion, dac: Dac, process: int) -> None:
-    """Brake the mirror of a scanner that was deleted, or is open when Python ends, and close its board. Errors are only
-    logged. process: number of the process that opened it; in another one, forked from it, nothing is done."""
+def _end(motion: _Motion, dac: Dac, process: int) -> None:
+    """Brake the mirror of a scanner that nobody closed, and close its board. Errors are only logged.
+
+    process: number of the process that opened it; in another one, forked from it, nothing is done.
+    """
     if os.getpid() != process:
-        return
-    if motion.thread is threading.current_thread():  # `on_fault` had the last reference to the scanner
-        threading.Thread(target=_forgotten, args=(motion, dac, process)).start()
         return
     moved = motion.thread is not None or motion.position != 0.0
     motion.stopping.set()

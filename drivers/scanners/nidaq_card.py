@@ -273,7 +273,10 @@ def _aside(work: Callable[[], Value], limit_s: float) -> Value:
         except BaseException as error:
             answer.set_exception(error)
 
-    threading.Thread(target=act, daemon=True).start()
+    try:
+        threading.Thread(target=act, daemon=True).start()
+    except RuntimeError:  # Python is ending: since 3.12 no thread begins then
+        act()
     try:
         return answer.result(limit_s)
     except TimeoutError:

@@ -4,15 +4,16 @@ nobody closes the board."""
 import logging
 import os
 import threading
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 from pydantic import model_validator
 
 from drivers.errors import DeviceError, DeviceFault, WrongState
 from drivers.interfaces import OUT_FRAME, OUT_GATE, OUT_MARKER, SyncSource
+from drivers.interfaces.forgotten import watch_for_end
 from drivers.registry import KindConfig
 
 _log = logging.getLogger(__name__)
@@ -76,12 +77,12 @@ class SyncBoard(SyncSource):
         """From now on take the outputs low if a program may still play when the device is deleted, or Python ends,
         without `close`. lower takes all outputs low, release gives up the port; neither may refer to the device."""
         self._may_play = threading.Event()
-        given = self.name, lower, release, self._may_play, os.getpid()
-        self._forgotten = weakref.finalize(self, _forgotten, *given)
+        self._end = partial(_end, self.name, lower, release, self._may_play, os.getpid())
+        self._forgotten = watch_for_end(self, self._end)
 
     def _note_raw(self, command: str) -> None:
         """Note that a raw command may raise the gate, unless it is one of `_questions`."""
-        if command.split(" ", 1)[0] not in self._questions:
+        if command.split(" ", 1)[0] not in self._questions or "\n" in command:
             self._may_play.set()
 
     def gate_low(self) -> None:
@@ -115,7 +116,7 @@ class SyncBoard(SyncSource):
             raise
 
 
-def _forgotten(
+def _end(
     name: str, lower: Callable[[], object], release: Callable[[], object], may_play: threading.Event, process: int
 ) -> None:
     """Take the outputs of a board low that may play a program, and release its port. Errors are only logged.
@@ -129,8 +130,10 @@ def _forgotten(
         try:
             lower()
             _log.warning("%s: may have been left playing; its outputs were taken low", name)
-        except DeviceError as error:
+        except BaseException as error:
             may_play.set()
+            if not isinstance(error, Exception):  # an interrupt; called again, it goes on from here
+                raise
             key = "turn the laser off by its key"
             _log.error("%s: was left playing and may open the gate, %s (%s)", name, key, error)
     release()

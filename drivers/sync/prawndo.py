@@ -255,7 +255,7 @@ class PrawnDo(SerialDevice, SyncBoard):
 
     def _do_close(self) -> None:
         self._forgotten.detach()
-        self._line.port.close()
+        self._end()  # once more, if the outputs could not be taken low
 
     def _identify(self) -> tuple[str, int]:
         """Firmware, and words that the board holds; raises ProtocolError for old firmware or an unknown board."""

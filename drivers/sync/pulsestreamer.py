@@ -269,7 +269,8 @@ class PulseStreamer(SyncBoard):
     def _do_close(self) -> None:
         if self._run is not None:
             self._run.over.set()
-        self._forgotten()  # once more, if the outputs could not be taken low
+        self._forgotten.detach()
+        self._end()  # once more, if the outputs could not be taken low
 
     def _lower(self, ended: Literal["stopped", "aborted"] = "aborted") -> None:
         """Take all outputs low at once, whatever other threads do, and disarm the trigger. A `run` under way gives up.

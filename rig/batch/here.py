@@ -72,6 +72,8 @@ def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) 
         with store:
             done = run_batch(store, Here(what, len(store.cases)), progress=progress)
             ended = done.verdict != "complete"
+            if done.reason and not done.done:
+                raise UsageError(f"{done.reason}, or set TMPDIR to another folder")
             if done.reason:
                 _log.warning("%s", done.reason)
             with interrupts_ignored(ended):

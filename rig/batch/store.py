@@ -123,12 +123,14 @@ class Store:
             self._hold(shared, begun=True)
 
     def give_up(self) -> None:
-        """Leave the folder as it was, if this store has begun it: the batch is refused before any case is done."""
-        if self._begun:
+        """Leave the folder as it was, if this store has begun it and no shard has joined: the batch is refused before
+        any case is done."""
+        if not self._begun or not self.alone():
+            return
+        with contextlib.suppress(OSError):  # another shard has results
+            (self.folder / CASES).rmdir()
             for name in (HEAD, LIST):
                 (self.folder / name).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # another shard has results
-                (self.folder / CASES).rmdir()
 
     def _hold(self, shared: bool, begun: bool = False) -> None:
         """Lock the folder. Raises UsageError if another process is at work in it.

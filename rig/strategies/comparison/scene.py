@@ -99,13 +99,14 @@ def open_scene(config: Mapping[str, Any], place: Place) -> OpenScene:
     """
     sums = {path: current_checksum(path) for path in files_of(config, place.scene)}
     key = json_line({"config": config, "place": asdict(place), "files": sums})
-    if key not in _kept:
+    opened = _kept.get(key)
+    if opened is None:
         close_scene()
         tell_stage("making the scene")
         opened = OpenScene(RigConfig.model_validate(config), place)
         opened.apparatus("energy", 0)  # light that all ways share is on nobody's computing time
         _kept[key] = opened
-    return _kept[key]
+    return opened
 
 
 def close_scene() -> None:
