@@ -17,7 +17,7 @@ def watch_for_end(device: object, end: Callable[[], object]) -> "weakref.finaliz
 def _call(end: Callable[[], object]) -> None:
     if threading.current_thread() is not threading.main_thread():
         try:
-            threading.Thread(target=end, name="end of a device").start()
+            threading.Thread(target=end, name="end of a device", daemon=False).start()
         except RuntimeError:  # Python is ending already
             end()
         return
