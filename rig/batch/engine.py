@@ -188,9 +188,14 @@ def _packed(store: Store, runs: "_Runs", *, only: bool) -> tuple[set[str], bool]
 
 def failure_line(failure: Mapping[str, Any]) -> str:
     """One line that says which case failed, with its settings, and how. failure: with the keys of `Failure`."""
-    setting = ", ".join(f"{name} {value}" for name, value in failure["labels"].items())
+    setting = setting_of(failure["labels"])
     times = "" if failure["attempts"] <= 1 else f", {failure['attempts']} times"
     return f"{setting or failure['case']}: {failure['kind']}{times}: {failure['message']}"
+
+
+def setting_of(labels: Mapping[str, Any]) -> str:
+    """The labels of a case in words."""
+    return ", ".join(f"{name} {value}" for name, value in labels.items())
 
 
 class _Runs:
@@ -316,6 +321,6 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
         first = next(iter(runs.failed.values()))
         if first.status == "other code":
             raise UsageError("the program was changed while cases were tried; run the command again")
-        setting = ", ".join(f"{name} {value}" for name, value in scratch.cases[first.name].labels.items())
+        setting = setting_of(scratch.cases[first.name].labels)
         raise UsageError(f"case {first.name} ({setting}) fails: {first.message}; `--case {first.name}` does it alone")
     return list(runs.times_s[1:] or runs.times_s)  # in the first one the process loads compiled code

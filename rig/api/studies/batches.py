@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from rig.api import strategies, tradeoffs
 from rig.batch.case import Case, Result
-from rig.batch.engine import Batch, Executor, probe, run_batch
+from rig.batch.engine import Batch, Executor, probe, run_batch, setting_of
 from rig.batch.pool import Limits, Pool, usual_workers
 from rig.batch.store import Row, Store, read_failures, read_rows
 from rig.batch.task import HEAD
@@ -176,7 +176,7 @@ class _Made:
                 same.append((case, first[meant]))
         if not same:
             return ()
-        words = [", ".join(f"{name} {value}" for name, value in each.labels.items()) for each in same[0]]
+        words = [setting_of(each.labels) for each in same[0]]
         return (
             f"{len(same)} of {len(self.cases)} combinations mean the same as another one, and are in the table once; "
             f"the first is '{words[0]}', which is '{words[1]}'",
