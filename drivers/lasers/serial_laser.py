@@ -11,6 +11,7 @@ import re
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Annotated, TypeVar
 
 from pydantic import Field
@@ -27,6 +28,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import LaserLimits, LaserStatus, LineLaser
 from drivers.interfaces.device import OPEN_STATES
+from drivers.interfaces.forgotten import watch_for_end
 from drivers.registry import KindConfig, Surroundings
 from drivers.transports.dialogue import Dialogue, Framing, LineTiming, OnSilence
 from drivers.transports.endpoints import EMULATED_PREFIX, printable, resolve
@@ -73,7 +75,7 @@ OFF_TIMES = 3
 second may come too soon after a reply to be heard."""
 
 
-def _forgotten(name: str, line: Dialogue, off: bytes, left: _Left, process: int) -> None:
+def _end(name: str, line: Dialogue, off: bytes, left: _Left, process: int) -> None:
     """Close the port of a laser that is closed or deleted; first switch it off by the bytes `off` if it may shine, and
     put its settings back. Only logs errors. process: number of the laser's process; in another one, which was forked
     from it, nothing is done."""
@@ -107,7 +109,7 @@ class SerialLaser(SerialDevice, LineLaser):
         self._limits = limits
         self._armed = False
         self._left = _Left()
-        self._forgotten: weakref.finalize[..., SerialLaser] | None = None
+        self._forgotten: weakref.finalize[..., object] | None = None
         self._stopped = False
         """Whether pause or disarm was called since arm began, which other threads may do."""
 
@@ -184,7 +186,8 @@ class SerialLaser(SerialDevice, LineLaser):
     def watch_for_end(self, off: bytes) -> None:
         """Have the laser told to switch off if it is deleted, or Python ends in the normal way, before `close`, or if
         `close` could not pause it. A failure is only logged. off: bytes that switch it off in any state."""
-        self._forgotten = weakref.finalize(self, _forgotten, self.name, self._line, off, self._left, os.getpid())
+        self._end = partial(_end, self.name, self._line, off, self._left, os.getpid())
+        self._forgotten = watch_for_end(self, self._end)
 
     def _make_safe(self) -> None:
         # A laser that cannot be paused keeps its settings: some of them keep it dark at its next power-up.
@@ -199,8 +202,8 @@ class SerialLaser(SerialDevice, LineLaser):
         self._line.tell(command)
 
     def _do_close(self) -> None:
-        if self._forgotten is not None:
-            self._forgotten()
+        if self._forgotten is not None and self._forgotten.detach() is not None:
+            self._end()
         self._line.port.close()
 
 
