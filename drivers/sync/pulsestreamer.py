@@ -254,7 +254,8 @@ class PulseStreamer(SyncBoard):
         if run is not None:
             asked_s = now_s(self._clock)
             plays = self._flag("isStreaming")
-            if not self._has_ended(run, asked_s, plays):
+            # Once another thread takes the outputs low, the box no longer knows that the program has ended.
+            if not self._has_ended(run, asked_s, plays) and self._aborts == run.aborts:
                 return SyncStatus("running" if plays else "waiting" if run.waits else "aborted", None)
         with self._lock:  # another thread may just be taking the outputs low
             plays = self._flag("isStreaming")

@@ -248,6 +248,41 @@ def test_sweeps_are_counted_to_their_end_and_then_markers_open_nothing(keeps_seq
         assert [level for _, level in box.changes(begun_s)].count(OUT_GATE) >= 3, "none is left out"
 
 
+@pytest.mark.parametrize("question", ["isStreaming", "hasFinished"])
+def test_a_program_is_not_said_to_wait_while_another_thread_finds_its_end(
+    question: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That thread takes the outputs low, after which the box does not remember that the program has ended."""
+    monkeypatch.setattr("drivers.sync.pulsestreamer._watch", lambda *watched: None)
+    with pulse_box() as box, box.open() as device:
+        device.program(SWEEP, 1)
+        device.run()
+        box.trigger.pulse(box.now_s + 1e-3, 1e-3)
+        box.clock.sleep(1.0)
+        call, run, main = device._rpc.call, device._run, threading.current_thread()
+        assert run is not None
+        lowered, asked = threading.Event(), threading.Event()
+        watching = threading.Thread(target=device._has_ended, args=(run, box.now_s, False))
+
+        def calling(method: str, *params: Any) -> Any:
+            from_main = threading.current_thread() is main
+            if from_main and method == question and not lowered.is_set():
+                watching.start()
+                assert lowered.wait(PATIENCE_S)
+            answer = call(method, *params)
+            if from_main and method == "hasFinished":
+                assert not answer
+                asked.set()
+            elif method == "constant" and not from_main and not lowered.is_set():
+                lowered.set()
+                assert asked.wait(PATIENCE_S)
+            return answer
+
+        monkeypatch.setattr(device._rpc, "call", calling)
+        assert device.status == SyncStatus("stopped", 0)
+        watching.join(PATIENCE_S)
+
+
 def test_a_close_whose_abort_failed_takes_the_outputs_low_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     with pulse_box() as box:
         device = box.open()
