@@ -1,28 +1,47 @@
-"""Interrupts that wait while results are being written."""
+"""Interrupts that do not get in the way of an orderly end: the first ends the work, later ones are ignored."""
 
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 
-ENDING = "SIGINT", "SIGTERM", "SIGHUP"
+ENDING = "SIGTERM", "SIGHUP", "SIGBREAK"
+"""Signals that end a program, besides Ctrl-C; no system has all of them."""
+_at_end: ContextVar[ExitStack | None] = ContextVar("_at_end", default=None)
+"""Of the outermost `one_interrupt`: gives the signals back at its end."""
 
 
 @contextmanager
-def interrupts_ignored(when: bool = True) -> Iterator[None]:
-    """A context in which signals that end a program are ignored, for the moments after a first one.
+def one_interrupt() -> Iterator[None]:
+    """A context for work that an interrupt ends in order; the work calls `ignore_interrupts` once it was interrupted.
 
-    when: whether they are at all. Outside the main thread, which alone gets signals, the context does nothing.
+    From then to the end of the outermost such context, further interrupts are ignored. `timeout` sends its signal
+    twice, and impatient people press Ctrl-C again, while results are still being written.
     """
-    if not when or threading.current_thread() is not threading.main_thread():
+    if _at_end.get() is not None:
         yield
         return
-    numbers = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
-    before = {number: handler for number in numbers if (handler := signal.getsignal(number)) is not None}
-    try:
-        for number in before:
-            signal.signal(number, signal.SIG_IGN)
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with ExitStack() as at_end:
+        token = _at_end.set(at_end)
+        try:
+            yield
+        finally:
+            _at_end.reset(token)
+
+
+def ignore_interrupts() -> None:
+    """Ignore interrupts from now to the end of the outermost `one_interrupt`, or of the program if there is none.
+
+    Outside the main thread, which alone gets signals, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    at_end = _at_end.get()
+    for name in ("SIGINT", *ENDING):
+        number = getattr(signal, name, None)
+        if number is None or (before := signal.getsignal(number)) is None:  # set by something other than Python
+            continue
+        if at_end is not None:
+            at_end.callback(signal.signal, number, before)
+        signal.signal(number, signal.SIG_IGN)

@@ -13,7 +13,7 @@ from rig.config.bundled import short_names
 from rig.config.models import RigConfig
 from rig.config.overrides import MAX_SEED, SIMULATED, Config, configure
 from rig.errors import UsageError, each_or_problems, noted
-from rig.interrupts import interrupts_ignored
+from rig.interrupts import one_interrupt
 from rig.progress import Progress
 from rig.requests import StrategiesRequest, TradeoffRequest
 from rig.run_folder.folder import RunFolder
@@ -63,10 +63,8 @@ def compare_strategies(
     loaded, ways, asked = _prepared(config, request)
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
-    with RunFolder(request.out) as folder:
-        done = run_comparison(loaded, ways, asked, progress)
-        with interrupts_ignored(done.verdict == "aborted"):
-            return write_files(folder, done)
+    with one_interrupt(), RunFolder(request.out) as folder:
+        return write_files(folder, run_comparison(loaded, ways, asked, progress))
 
 
 def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:

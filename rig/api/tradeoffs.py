@@ -11,7 +11,7 @@ from rig.devices.calibration_use import accepted_by, calibration_use
 from rig.devices.open import open_rig
 from rig.errors import UsageError, noted
 from rig.estimate.registry import ESTIMATORS, FILTERS
-from rig.interrupts import interrupts_ignored
+from rig.interrupts import one_interrupt
 from rig.progress import Progress
 from rig.requests import TradeoffRequest
 from rig.run_folder.folder import RunFolder
@@ -60,10 +60,8 @@ def tradeoff(
 
     if request.out is None:
         return run()
-    with RunFolder(request.out) as folder:
-        done = run()
-        with interrupts_ignored(done.verdict == "aborted"):
-            return ready.write(folder, done)
+    with one_interrupt(), RunFolder(request.out) as folder:
+        return ready.write(folder, run())
 
 
 def as_cases(config: Config, request: TradeoffRequest) -> tuple[list[Case], WriteResults]:

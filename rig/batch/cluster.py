@@ -401,7 +401,12 @@ def _lost(name: str, future: "Future[Any]") -> Ended:
 
 
 def _require_able(client: "Client", store: Store) -> None:
-    """Raise UsageError if a worker does not see the folder or an input, or has another version of the code."""
+    """Raise UsageError if the client cannot be used, or if a worker does not see the folder or an input, or has another
+    version of the code."""
+    if client.asynchronous:
+        raise UsageError("`client` is asynchronous; open it with asynchronous=False")
+    if client.status != "running":
+        raise UsageError(f"`client` is {client.status}, not connected to its scheduler; open a new one")
     head = checksum(str(store.folder / HEAD))
     files = store.checksums
     found = client.run(_problems, str(store.folder), head, files, store.codes, on_error="return")

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, Protocol
 from rig.batch.store import FAILURES, Store, failure_files
 from rig.batch.task import Ended, Status, Task
 from rig.errors import UsageError
-from rig.interrupts import interrupts_ignored
+from rig.interrupts import ignore_interrupts, one_interrupt
 from rig.progress import Progress, tell_stage
 from rig.run_folder.disk import replace_file
 from rig.run_folder.plain_json import json_line
@@ -123,25 +123,23 @@ def run_batch(
     runs = _Runs(store, executor, [name for name in mine if name not in finished], retries)
     told = _Told(len(mine) - len(runs.waiting), len(mine), progress)
     aborted = False
-    ending = contextlib.ExitStack()
-    try:
-        for _ in runs.steps():
-            told.tell(runs, executor)
-    except KeyboardInterrupt:
-        # A second one, as `timeout` sends it and impatient people do, must not keep the table from being written.
-        ending.enter_context(interrupts_ignored())
-        aborted = True
-    finally:
-        with ending:
+    with one_interrupt():
+        try:
+            for _ in runs.steps():
+                told.tell(runs, executor)
+        except KeyboardInterrupt:
+            ignore_interrupts()
+            aborted = True
+        finally:
             try:
                 executor.close()
             except KeyboardInterrupt:
-                ending.enter_context(interrupts_ignored())
+                ignore_interrupts()
                 aborted = True
             except Exception as error:  # the table is written all the same
                 _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
             there, packed = _packed(store, runs, only=shard[1] == 1)
-        done, total = len(there), len(store.cases)
+    done, total = len(there), len(store.cases)
     for name in runs.done - there:
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
     failures = tuple(

@@ -14,7 +14,7 @@ from rig.batch.engine import run_batch
 from rig.batch.store import Store
 from rig.batch.task import Ended, Task, perform
 from rig.errors import UsageError
-from rig.interrupts import interrupts_ignored
+from rig.interrupts import one_interrupt
 from rig.progress import Progress, part
 
 _log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) 
     Returns the results in the order of the cases, and whether an interrupt ended it; those that are missing then are
     None. Raises what a case raises. If there is no room for results, that is logged and ends it like an interrupt.
     """
-    with tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder:
+    with one_interrupt(), tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder:
         try:
             store = Store(Path(folder) / "all", cases)
         except UsageError as error:
@@ -76,5 +76,4 @@ def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) 
                 raise UsageError(f"{done.reason}, or set TMPDIR to another folder")
             if done.reason:
                 _log.warning("%s", done.reason)
-            with interrupts_ignored(ended):
-                return store.results(), ended
+            return store.results(), ended

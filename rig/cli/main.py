@@ -34,9 +34,8 @@ from rig.cli.command import (
     say,
     tell,
 )
+from rig.interrupts import ENDING, ignore_interrupts
 
-_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
-"""Signals that end a program, besides Ctrl-C; no system has all of them."""
 _TYPER_INTERRUPTED = 130
 """Exit code that typer returns after an interrupt."""
 _AGAIN_S = 0.01
@@ -78,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         except (KeyboardInterrupt, Exception) as error:
             code = _say_why(error, arguments)
         if argv is None:
-            _ignore_interrupts()
+            ignore_interrupts()  # the command is done, and its exit code says what came of it
         if code == _TYPER_INTERRUPTED:  # an interrupt before a command had begun, or a second one while it ended
             code = fail(EXIT_ABORTED, [], ["aborted"], "--json" in arguments)
     code = code if isinstance(code, int) else 0
@@ -110,14 +109,6 @@ def _go_on_unread() -> None:
             setattr(sys, name, io.TextIOWrapper(output, before.encoding, before.errors, None, before.line_buffering))
 
 
-def _ignore_interrupts() -> None:
-    """Ignore interrupts from now on: the command is done, and its exit code says what came of it."""
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGINT", *_ENDING):
-            if (number := getattr(signal, name, None)) is not None:
-                signal.signal(number, signal.SIG_IGN)
-
-
 def _end_at_rest(code: int) -> None:
     """Return when no thread of a scan is at work any more; if one goes on, end the process here, with this code."""
     threads = sys.modules.get("rig.threads")  # without it there are no such threads, and it is slow to import
@@ -145,7 +136,7 @@ def _signals_interrupt() -> Iterator[None]:
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for name in _ENDING:
+        for name in ENDING:
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 before[number] = signal.signal(number, interrupt)

@@ -21,7 +21,7 @@ from rig.batch.store import Row, Store, read_failures, read_rows
 from rig.batch.task import HEAD
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
-from rig.interrupts import interrupts_ignored
+from rig.interrupts import one_interrupt
 from rig.progress import Progress
 from rig.report.csv_file import csv_of
 from rig.requests import BatchRequest, StrategiesRequest, TradeoffRequest
@@ -100,7 +100,8 @@ def batch(
     made = _made(loaded)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     folder = Path(request.out).absolute()
-    with Store(folder, made.cases, {"study": loaded.model_dump(mode="json")}, shared=shard[1] > 1) as store:
+    content = {"study": loaded.model_dump(mode="json")}
+    with one_interrupt(), Store(folder, made.cases, content, shared=shard[1] > 1) as store:
         try:
             executor = executor_of(request, store, limits, client)
         except BaseException:
@@ -110,10 +111,8 @@ def batch(
         done = run_batch(
             store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
         )  # fmt: skip
-        aborted = done.verdict == "aborted"
         if done.packed:
-            with interrupts_ignored(aborted):
-                _write_tables(store, made, aborted)
+            _write_tables(store, made, done.verdict == "aborted")
     return BatchResult(replace(done, notes=(*made.notes, *done.notes)), folder)
 
 

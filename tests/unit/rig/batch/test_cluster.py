@@ -1,5 +1,6 @@
 """Cases on a dask cluster: in this process, and once on workers of their own, of which one is killed."""
 
+import asyncio
 import gc
 import importlib
 import os
@@ -148,6 +149,21 @@ def test_a_client_that_has_lost_its_scheduler_for_good_is_an_error(tmp_path: Pat
         assert (executor.room, executor.workers) == (0, 0)
         with pytest.raises(RigError, match="the scheduler is gone; start it, then run this again"):
             run_batch(store, executor)
+
+
+def test_a_client_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, cluster: Any) -> None:
+    def refused(client: Any, said: str) -> None:
+        with Store(tmp_path / "out", squares(1)) as store, pytest.raises(UsageError, match=f"^`client` is {said}"):
+            Cluster(store, client)
+
+    async def in_a_loop() -> None:
+        async with distributed.Client(cluster.scheduler_address, set_as_default=False, asynchronous=True) as client:
+            refused(client, "asynchronous; open it with")
+
+    closed = distributed.Client(cluster, set_as_default=False)
+    closed.close()
+    refused(closed, "closed, not connected to its scheduler; open a new one")
+    asyncio.run(in_a_loop())
 
 
 @pytest.mark.parametrize(
