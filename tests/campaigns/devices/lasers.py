@@ -69,6 +69,8 @@ class Sequence:
         )
         self._server = SerialWire(self._model, clock=self._clock, baud=1_000_000, faults=self._faults)
         self._laser: LineLaser | None = None
+        self._may_be_off = False
+        """Whether it may have been switched off by a verb that failed since it was armed."""
 
     def run(self) -> Ending:
         with self._server:
@@ -91,14 +93,17 @@ class Sequence:
             case "status":
                 self._verb(verb, lambda: self._check_status(laser))
             case "arm":
-                if self._verb(verb, lambda: laser.arm(power_w)):
+                self._may_be_off = not self._verb(verb, lambda: laser.arm(power_w))
+                if not self._may_be_off:
                     assert self._model.gated, "armed, and the gate does not govern the light"
                     assert abs(told_power_w(self._model) - power_w) <= 0.011 * power_w + 5e-5, "armed at another power"
                     assert not isinstance(self._model, IbeamModel) or not self._model.closed_gate_power_w, "leaks"
             case "pause":
+                self._may_be_off = True
                 if self._verb(verb, laser.pause):
                     self._stays_dark("paused")
             case "disarm":
+                self._may_be_off = True
                 if self._verb(verb, laser.disarm):
                     on = self._model.on if isinstance(self._model, CoboltModel) else self._model.state_on
                     assert not on, "disarmed, and on"
@@ -130,7 +135,7 @@ class Sequence:
             return
         if not isinstance(self._model, IbeamModel):  # it cannot be asked
             assert status.interlock_closed != self._model.interlock_open, "the interlock is not what the status says"
-        elif status.armed and not status.emission and laser.state is DeviceState.RUNNING:
+        elif status.armed and not status.emission and laser.state is DeviceState.RUNNING and not self._may_be_off:
             assert status.fault, "it was armed and went off, and the status says nothing"
         assert status.emission or not (emitting and self._model.emitting), (
             "it emits and the status says that it does not"
