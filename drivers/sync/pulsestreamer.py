@@ -256,12 +256,16 @@ class PulseStreamer(SyncBoard):
             plays = self._flag("isStreaming")
             # Once another thread takes the outputs low, the box no longer knows that the program has ended.
             if not self._has_ended(run, asked_s, plays) and self._aborts == run.aborts:
-                return SyncStatus("running" if plays else "waiting" if run.waits else "aborted", None)
+                return self._not_ended(run, plays)
         with self._lock:  # another thread may just be taking the outputs low
-            plays = self._flag("isStreaming")
-            if plays or self._run is not None:
-                return SyncStatus("running", None)
+            plays, run = self._flag("isStreaming"), self._run
+            if plays or run is not None:  # the outputs could not be taken low
+                return self._not_ended(run, plays)
             return SyncStatus(self._ended, 0 if self._safe else None)
+
+    @staticmethod
+    def _not_ended(run: _Run | None, plays: bool) -> SyncStatus:
+        return SyncStatus("running" if plays else "waiting" if run is not None and run.waits else "aborted", None)
 
     def _make_safe(self) -> None:
         self._rpc.call_s = min(self._rpc.call_s, CLOSE_S)
