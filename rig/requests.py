@@ -2,16 +2,20 @@
 
 Each field has a type and a phrase that describes it, which `rig scan --help` and `help(ScanRequest)` show.
 `rig/cli/command.py` makes an option of each field. Each field says what None means; for settings that a config has too,
-None means the config's value (`rig/config/models.py`).
+None means the config's value (`rig/config/models.py`). A value of another type than the field's is a UsageError.
 """
 
 import inspect
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from fractions import Fraction
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from rig.errors import UsageError
 
 Default = TypeVar("Default")
 Request = TypeVar("Request")
@@ -58,6 +62,49 @@ def request_content(request: object) -> dict[str, Any]:
     return {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in values.items()}
 
 
+class CheckedRequest:
+    """The base of all requests."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Raise UsageError, with a line for each field whose value is of another type."""
+        problems = [
+            f"`{name}` is {value!r}; it must be {' or '.join(_WORDS[each] for each in types if each in _WORDS)}"
+            for name, types in _types_of(type(self)).items()
+            if not any(_is_of(value := getattr(self, name), each) for each in types)
+        ]
+        if problems:
+            raise UsageError.of(problems)
+
+
+_WORDS: Mapping[Any, str] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    Fraction: "a fraction",
+    os.PathLike[str]: "a path",
+    Sequence[str]: "a list of text",
+    Sequence[int]: "a list of whole numbers",
+}
+
+
+def _types_of(request: type) -> Mapping[str, tuple[Any, ...]]:
+    """The types that each field may have; fields of any type are left out."""
+    hints = {name: hint for name, hint in get_type_hints(request).items() if hint is not Any}
+    return {name: get_args(hint) if get_origin(hint) is UnionType else (hint,) for name, hint in hints.items()}
+
+
+def _is_of(value: object, wanted: Any) -> bool:
+    if get_origin(wanted) is Sequence:
+        of = get_args(wanted)[0]
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(_is_of(each, of) for each in value)
+    if wanted in (int, float):  # numpy's are numbers too; True is one only by an accident of Python
+        return isinstance(value, Integral if wanted is int else Real) and not isinstance(value, bool)
+    return isinstance(value, get_origin(wanted) or wanted)
+
+
 # Fields that several requests have.
 
 
@@ -88,7 +135,7 @@ def _board_scene() -> str | None:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReconstructRequest:
+class ReconstructRequest(CheckedRequest):
     """Depth maps of existing frames (`rig reconstruct`)."""
 
     estimator: str | None = option(None, "auto, argmax, edge, likelihood or joint", unset="as configured, else auto")
@@ -152,7 +199,7 @@ class ReplayRequest(RunRequest):
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AlignRequest:
+class AlignRequest(CheckedRequest):
     """A look at the laser line at low power, to set a rig up (`rig align`)."""
 
     power: str | None = option(None, "of the laser, such as '5 mW'", unset="a tenth of its limit")
@@ -165,7 +212,7 @@ class AlignRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TradeoffRequest:
+class TradeoffRequest(CheckedRequest):
     """Scans of a simulated rig with all combinations of some settings (`rig tradeoff`)."""
 
     scenes: Sequence[str] = option((), "scenes, separated by commas", unset="the config's", name="scene")
@@ -201,7 +248,7 @@ class StrategiesRequest(TradeoffRequest):
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BatchRequest:
+class BatchRequest(CheckedRequest):
     """All cases of a study, on this computer or on many (`rig batch`)."""
 
     out: str | os.PathLike[str] | None = path_option("folder of the study: new, or to go on with", "none")
@@ -214,7 +261,7 @@ class BatchRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SoakRequest:
+class SoakRequest(CheckedRequest):
     """A long stream at the sensor's rate, played in real time (`rig bench --soak`)."""
 
     threads: int | None = option(None, "most threads to count and estimate with", unset="one a core", least=1)
@@ -230,7 +277,7 @@ class SoakRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunsRequest:
+class RunsRequest(CheckedRequest):
     """A list of the runs in a folder (`rig runs`). A run is listed if it passes every filter that is given."""
 
     tags: Sequence[str] = option((), "with all of these tags, separated by commas", unset="any", name="tag")
@@ -246,7 +293,7 @@ class RunsRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ViewRequest:
+class ViewRequest(CheckedRequest):
     """A page in the browser that shows a run (`rig view`)."""
 
     host: str = option("127.0.0.1", "address to listen on; 0.0.0.0 is the whole network, with a token")
@@ -260,7 +307,7 @@ class ViewRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StreamRequest:
+class StreamRequest(CheckedRequest):
     """A stream of depth maps for other programs (`rig stream`)."""
 
     host: str = option("127.0.0.1", "address to listen on; 0.0.0.0 is the whole network, with a token")
@@ -270,7 +317,7 @@ class StreamRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CutRequest:
+class CutRequest(CheckedRequest):
     """A part of a recording (`rig cut`). Give exactly one of `maps`, `frames` and `time`."""
 
     maps: str | None = option(None, "A:B, maps A to before B, from 0")
@@ -281,7 +328,7 @@ class CutRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImportRequest:
+class ImportRequest(CheckedRequest):
     """Import of frames from another program's files (`rig import`)."""
 
     form: str | None = option(
@@ -298,7 +345,7 @@ class ImportRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExportRequest:
+class ExportRequest(CheckedRequest):
     """Pictures and films of a run (`rig export`)."""
 
     view: str | None = option(
@@ -310,7 +357,7 @@ class ExportRequest:
 
 @described
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationRequest:
+class CalibrationRequest(CheckedRequest):
     """A calibration with a rig, or with frames taken with one."""
 
     seed: int = option(0, "seed of everything simulated")

@@ -1,9 +1,10 @@
 """A case: a function, and inputs on which alone its result depends.
 
 A case is named by a digest of all that decides its result: the function, its inputs, the contents of the files that it
-reads, and the code. So the same case has the same name on every computer, and a result under another name is of
-something else. The function is called with the inputs and returns a mapping. What it returns under `measured`, such as
-times, may differ from computer to computer; everything else must not.
+reads, and the code, with that of installed plugins. So the same case has the same name on every computer, wherever the
+program is installed, and a result under another name is of something else. The function is called with the inputs and
+returns a mapping. What it returns under `measured`, such as times, may differ from computer to computer; everything
+else must not.
 """
 
 import functools
@@ -13,6 +14,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -25,11 +27,16 @@ from rig.run_folder.manifest import MANIFEST, package_versions
 from rig.run_folder.plain_json import json_line
 
 OWN_PACKAGES: Final = "calibration", "config", "drivers", "rig", "sim_backend", "spadrig"
+PLUGIN_GROUPS: Final = "spadrig."
+"""Begin of the names of the groups of entry points that plugins have."""
 CODE_SUFFIXES: Final = ".py", ".yaml", ".npz"
 NUMERIC_PACKAGES: Final = "numpy", "numba", "opencv-contrib-python-headless"
 """Packages whose versions count as code: their results may differ in the last digits."""
 MEASURED: Final = "measured"
 NAME_DIGITS: Final = 24
+
+INSTALLED: Final = "{spadrig}"
+"""Stands in a case for the folder in which the program is installed, which is another one on every computer."""
 
 Result = Mapping[str, Any]
 """The values that the function of a case returns."""
@@ -42,6 +49,8 @@ class Case:
     function: 'package.module:name'. inputs: plain values, passed as keyword arguments. labels: what tells this case
     from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
     keeps: whether it writes files of its own, into a folder that it gets as the input `keep`.
+
+    Files of the program itself count as code. In inputs, INSTALLED stands for its folder.
     """
 
     function: str
@@ -49,6 +58,11 @@ class Case:
     labels: Mapping[str, Any] = field(default_factory=dict)
     files: tuple[str, ...] = ()
     keeps: bool = False
+
+    def __post_init__(self) -> None:
+        """Put INSTALLED in the place of the program's own folder."""
+        object.__setattr__(self, "inputs", {key: _with_installed(value) for key, value in self.inputs.items()})
+        object.__setattr__(self, "files", tuple(file for file in self.files if not _is_installed(file)))
 
     def call(self) -> Result:
         """The result, computed here and now. Raises what the function raises."""
@@ -64,7 +78,8 @@ class Case:
 def call(function: str, inputs: Mapping[str, Any]) -> Result:
     """Call a function by its name, 'package.module:name'. Raises TypeError if it returns no mapping."""
     module, _, name = function.partition(":")
-    result = getattr(import_module(module), name)(**inputs)
+    given = {key: _here(value) for key, value in inputs.items()}
+    result = getattr(import_module(module), name)(**given)
     if not isinstance(result, Mapping):
         raise TypeError(f"{function} returned {type(result).__name__}; the result of a case is a mapping")
     return result
@@ -72,20 +87,56 @@ def call(function: str, inputs: Mapping[str, Any]) -> Result:
 
 @functools.cache
 def code_digest(package: str = "rig") -> str:
-    """Digest of our code and of the versions that matter, together with the code of the package of a case's function.
+    """Digest of our code and of the versions that matter, together with the code of all plugins and of the package of a
+    case's function.
 
     package: the first part of the function's name.
     """
     digest = hashlib.sha256()
     folders = [TOP / name for name in OWN_PACKAGES]
-    if package not in OWN_PACKAGES and (spec := find_spec(package)) is not None:
-        folders += map(Path, list(spec.submodule_search_locations or [spec.origin or ""])[:1])
+    for other in sorted({package, *_plugins()}.difference(OWN_PACKAGES)):
+        if (spec := find_spec(other)) is not None:
+            folders += map(Path, list(spec.submodule_search_locations or [spec.origin or ""])[:1])
     for folder in folders:
         for file in sorted(_sources(folder)):
             path = file.relative_to(folder.parent)
             digest.update(f"{path} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
     digest.update(repr(numeric_versions()).encode())
     return digest.hexdigest()[:NAME_DIGITS]
+
+
+def _plugins() -> set[str]:
+    """The packages that add devices, estimators or ways to measure depth, by the entry points of their groups."""
+    entries = (entry for distribution in distributions() for entry in distribution.entry_points)
+    return {entry.module.partition(".")[0] for entry in entries if entry.group.startswith(PLUGIN_GROUPS)}
+
+
+def _is_installed(path: str) -> bool:
+    """Whether a path is of a file of the program itself, whose content `code_digest` knows."""
+    own = any(Path(path).is_relative_to(TOP / name) for name in OWN_PACKAGES)
+    return own and Path(path).suffix in CODE_SUFFIXES
+
+
+def _with_installed(value: Any) -> Any:
+    """A plain value with INSTALLED in place of the program's folder, in the paths of its files."""
+    if isinstance(value, Mapping):
+        return {key: _with_installed(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_installed(each) for each in value]
+    if isinstance(value, str) and value.startswith(str(TOP)) and _is_installed(value):
+        return f"{INSTALLED}/{Path(value).relative_to(TOP).as_posix()}"
+    return value
+
+
+def _here(value: Any) -> Any:
+    """A plain value with the program's folder on this computer in place of INSTALLED."""
+    if isinstance(value, Mapping):
+        return {key: _here(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_here(each) for each in value]
+    if isinstance(value, str) and value.startswith(f"{INSTALLED}/"):
+        return str(TOP / value.removeprefix(f"{INSTALLED}/"))
+    return value
 
 
 def package_of(function: str) -> str:

@@ -82,6 +82,8 @@ class Cluster:
         close: Callable[[], object] | None = None,
         looked: Callable[[], object] | None = None,
     ) -> None:
+        if not all(hasattr(client, name) for name in ("submit", "gather", "nthreads")):
+            raise UsageError(f"`client` is {type(client).__name__}; give a distributed.Client of the cluster")
         self._store, self._client = store, client
         self._close, self._looked = close, looked
         self._limits = limits or Limits()
@@ -167,8 +169,7 @@ class Cluster:
     def wait(self) -> list[Ended]:
         """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone, or all
         workers."""
-        if self._client.status == "closed":
-            raise RigError("the scheduler is gone; start it, then run this again: it goes on where it stopped")
+        self._require_client()
         if self._retired and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
             raise UsageError("no worker is left", *self.notes)
         if self._parcel and self._client.status == "running":
@@ -180,6 +181,7 @@ class Cluster:
                 futures.append(self._ended.get_nowait())
         except Empty:
             pass
+        self._require_client()
         mine = [(future, sent[1]) for future in futures if (sent := self._sent.pop(str(future.key), None)) is not None]
         try:
             told = self._client.gather([f for f, _ in mine if f.status == "finished"], errors="skip")
@@ -192,6 +194,14 @@ class Cluster:
             begun = sum(each.status != "not begun" for each in parcel)
             self._case_s += (1 - (1 - NEWEST_SHARE) ** begun) * (min(case_s, PARCEL_S) - self._case_s)
         return ended
+
+    def _require_client(self) -> None:
+        """Raise RigError if the client was closed, by its owner or since its scheduler is gone."""
+        if self._client.status == "closed":
+            raise RigError(
+                "the client was closed, or the scheduler is gone; start it, then run this again: it goes on where it "
+                "stopped"
+            )
 
     def close(self) -> None:
         """Give up what is under way, and close what was opened for this executor."""
@@ -433,5 +443,5 @@ def _problems(folder: str, head: str, files: Mapping[str, str], codes: Mapping[s
     if os.path.isdir(folder) and not os.access(folder, os.W_OK):
         problems.append(f"cannot write {folder}; share it for writing")
     if any(code_digest(package) != code for package, code in codes.items()):
-        problems.append("has another version of the code or of its packages; install the same one")
+        problems.append("has another version of the code, a plugin or a package; install the same one and restart it")
     return problems

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Final, Literal, Protocol
 
-from rig.batch.store import FAILURES, Store, failure_files
+from rig.batch.store import FAILURES, Store, failure_files, read_failures
 from rig.batch.task import Ended, Status, Task
 from rig.errors import UsageError
 from rig.interrupts import ignore_interrupts, one_interrupt
@@ -86,7 +86,8 @@ class Batch:
 
     verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, whose other cases are done elsewhere),
     'stopped' (results could not be written any more, or the code has changed; `reason` says why), or 'aborted' by an
-    interrupt. packed: whether the table has been written; of several shards the last one does it.
+    interrupt. packed: whether the table has been written; of several shards the last one does it. failures_file: name
+    of the file with all failures, in the batch's folder.
     """
 
     done: int
@@ -100,6 +101,7 @@ class Batch:
     workers: int = 0
     notes: tuple[str, ...] = ()
     packed: bool = True
+    failures_file: str = FAILURES
 
 
 def run_batch(
@@ -119,7 +121,11 @@ def run_batch(
     """
     begun = time.monotonic()
     mine = list(store.cases)[shard[0] :: shard[1]]
-    finished = store.finished()
+    try:
+        finished = store.finished()
+    except BaseException:
+        executor.close()
+        raise
     runs = _Runs(store, executor, [name for name in mine if name not in finished], retries)
     told = _Told(len(mine) - len(runs.waiting), len(mine), progress)
     aborted = False
@@ -151,10 +157,15 @@ def run_batch(
     )  # fmt: skip
     file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0] + 1}-of-{shard[1]}.jsonl")
     with contextlib.suppress(OSError):  # the disk is full: they are returned all the same
-        for old in failure_files(store.folder) if packed else [file]:
-            old.unlink(missing_ok=True)
-        if failures:
-            replace_file(file, "".join(json_line(asdict(failure)) for failure in failures).encode())
+        before = failure_files(store.folder) if packed else [file] if file.exists() else []
+        listed = [asdict(failure) for failure in failures]
+        if aborted or runs.stopped:  # those that failed before and were not tried again
+            again = {*there, *runs.failed}
+            listed += [line for line in read_failures(*before) if line["case"] not in again]
+        for old in before:
+            old.unlink()
+        if listed:
+            replace_file(file, "".join(map(json_line, listed)).encode())
     verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
     if aborted:
         verdict = "aborted"
@@ -166,21 +177,25 @@ def run_batch(
         verdict = "complete" if packed else "part"
     return Batch(
         done, total, len(runs.done), failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
-        runs.most, tuple(executor.notes), packed,
+        runs.most, tuple(executor.notes), packed, file.name,
     )  # fmt: skip
 
 
 def _packed(store: Store, runs: "_Runs", *, only: bool) -> tuple[set[str], bool]:
     """Write the table, if no other shard is at work; returns the finished cases of all shards, and whether the table
     has been written. only: whether there is no other shard."""
-    # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
-    there = set() if only else store.finished()
-    if only or (store.alone() and len(there := store.finished()) == len(store.cases)):
-        try:
-            return store.pack(), True
-        except OSError as error:
+    there = set(runs.done)
+    try:
+        # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
+        if not only:
             there = store.finished()
-            runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
+        if only or (store.alone() and len(there := store.finished()) == len(store.cases)):
+            return store.pack(), True
+    except OSError as error:
+        there = store.finished()
+        runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
+    except UsageError as error:
+        runs.stopped = str(error)
     return there, False
 
 

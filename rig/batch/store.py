@@ -72,15 +72,15 @@ class Store:
         for name, case in zip(self.names, cases, strict=True):
             self.cases.setdefault(name, case)
         self.codes = codes
-        lines = "".join(
+        self._lines = "".join(
             json_line({CASE: name, **asdict(case), "files": {path: sums[path] for path in case.files}})
             for name, case in self.cases.items()
         )
         self.head = {"schema": SCHEMA, "code": codes, "versions": numeric_versions(), **(title or {})}
         self._lock = -1
-        self._begun = False
+        self._begun = self._made = False
         try:
-            self._claim(lines, shared)
+            self._claim(shared)
         except OSError as error:
             self.close()
             raise UsageError(f"cannot write {self.folder}: {error.strerror}; name another folder as `out`") from error
@@ -102,21 +102,18 @@ class Store:
             os.close(self._lock)
             self._lock = -1
 
-    def _claim(self, lines: str, shared: bool) -> None:
+    def _claim(self, shared: bool) -> None:
         folder = self.folder
-        if folder.exists() and not folder.is_dir():
-            raise UsageError(f"`out={folder}` is a file; name a new folder")
+        self._made = not folder.exists()
+        _require_new_or_batch(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        there = {each.name for each in folder.iterdir()}
-        if HEAD not in there and there - (_BEGUN if LOCK in there else set()):
-            raise UsageError(f"`out={folder}` has something else in it; name a new folder, or that of the same study")
         self._lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT)
         self._hold(shared)
         self._begun = not (folder / HEAD).exists()
         if not self._begun:
-            self._require_same(lines)
+            self._require_same(folder)
         else:
-            replace_file(folder / LIST, lines.encode())
+            replace_file(folder / LIST, self._lines.encode())
             replace_file(folder / HEAD, (json_text(self.head) + "\n").encode())
         (folder / CASES).mkdir(exist_ok=True)
         if shared:
@@ -131,6 +128,9 @@ class Store:
             (self.folder / CASES).rmdir()
             for name in (HEAD, LIST):
                 (self.folder / name).unlink(missing_ok=True)
+            if self._made:
+                (self.folder / LOCK).unlink()
+                self.folder.rmdir()
 
     def _hold(self, shared: bool, begun: bool = False) -> None:
         """Lock the folder. Raises UsageError if another process is at work in it.
@@ -151,35 +151,47 @@ class Store:
                 raise UsageError(f"another process is at work in {self.folder}; wait until it has ended")
             time.sleep(LOCK_LOOK_S)
 
-    def _require_same(self, lines: str) -> None:
-        """Raise UsageError if the folder has been begun with other cases, or with other code."""
+    def _require_same(self, folder: Path) -> None:
+        """Raise UsageError if a folder has been begun with other cases, or with other code."""
         try:
-            before = json.loads((self.folder / HEAD).read_text(encoding="utf-8"))
-            listed = (self.folder / LIST).read_text(encoding="utf-8")
+            before = json.loads((folder / HEAD).read_text(encoding="utf-8"))
+            listed = (folder / LIST).read_text(encoding="utf-8")
         except (OSError, ValueError) as error:
-            raise UsageError(f"{self.folder} has no batch that can be read ({error}); name a new folder") from error
-        if listed == lines and before.get("code") == self.head["code"]:
+            raise UsageError(f"{folder} has no batch that can be read ({error}); name a new folder") from error
+        if listed == self._lines and before.get("code") == self.head["code"]:
             return
         if before.get("versions") != self.head["versions"]:
             what = f"with other versions of packages: {before.get('versions')}, here {self.head['versions']}"
         elif before.get("code") != self.head["code"]:
-            what = "with another version of the code"
+            what = "with another version of the code or of a plugin"
         else:
             there = {each[CASE] for each in map(json.loads, listed.splitlines())}
             same = len(there & self.cases.keys())
             if same == len(there) < len(self.cases):
                 raise UsageError(
-                    f"{self.folder} was begun with {same} of these {len(self.cases)} cases, and a study stays as it "
+                    f"{folder} was begun with {same} of these {len(self.cases)} cases, and a study stays as it "
                     "was begun; name another folder for all of them"
                 )
             what = f"with other cases: {len(there)}, of which {same} are the same"
-        raise UsageError(f"{self.folder} was begun {what}; name another folder for what you ask now")
+        raise UsageError(f"{folder} was begun {what}; name another folder for what you ask now")
 
     def task(self, name: str) -> Task:
         """A case as it is sent to a worker."""
         case = self.cases[name]
         code, files = self.codes[package_of(case.function)], {path: self.checksums[path] for path in case.files}
         return Task(name, case.function, case.inputs, code, str(self.folder), case.keeps, files)
+
+    def finished_in(self, folder: Path) -> set[str]:
+        """Names of the cases that have a result in another folder, where somebody may be at work. Raises UsageError if
+        that folder cannot be used for this batch."""
+        try:
+            _require_new_or_batch(folder)
+        except OSError as error:
+            raise UsageError(f"cannot read {folder}: {error.strerror}; name another folder as `out`") from error
+        if not (folder / HEAD).exists():
+            return set()
+        self._require_same(folder)
+        return {row.case for row in read_rows(folder)}
 
     def finished(self) -> set[str]:
         """Names of the cases that have a result. Files that a loss of power has torn are removed."""
@@ -232,6 +244,17 @@ class Store:
         return True
 
 
+def _require_new_or_batch(folder: Path) -> None:
+    """Raise UsageError if a folder is there that has something else than a batch in it. May raise OSError."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UsageError(f"`out={folder}` is a file; name a new folder")
+    there = {each.name for each in folder.iterdir()}
+    if HEAD not in there and there - (_BEGUN if LOCK in there else set()):
+        raise UsageError(f"`out={folder}` has something else in it; name a new folder, or that of the same study")
+
+
 def read_rows(folder: Path) -> Iterator[Row]:
     """All finished cases of a batch, in order. Raises UsageError if the folder has no batch."""
     try:
@@ -261,9 +284,9 @@ def _results(folder: Path) -> dict[str, Path]:
     return results
 
 
-def read_failures(folder: Path) -> list[dict[str, Any]]:
-    """The cases that failed, as `rig.batch.engine.Failure` has them: those of all shards."""
-    return [line for file in failure_files(folder) for line in _lines(file)]
+def read_failures(*files: Path) -> list[dict[str, Any]]:
+    """The cases in these files that failed, as `rig.batch.engine.Failure` has them."""
+    return [line for file in files for line in _lines(file)]
 
 
 def failure_files(folder: Path) -> list[Path]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from rig.batch.case import MEASURED, call, changed_file, code_digest, package_of
+from rig.errors import UsageError
 from rig.run_folder.plain_json import json_line
 
 CASES: Final = "cases"
@@ -173,11 +174,14 @@ def write_once(file: Path, text: str) -> None:
 
 
 def read_result(file: Path, name: str) -> dict[str, Any] | None:
-    """A result as it was written; None if it was torn by a loss of power."""
+    """A result as it was written; None if it was torn by a loss of power, or is not there. Raises UsageError if it
+    cannot be read."""
     try:
         text = file.read_text(encoding="utf-8")
         content = json.loads(text)
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return None
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror}; make it readable, then run it again") from error
     whole = text.endswith("\n") and isinstance(content, dict) and content.get(CASE) == name
     return content if whole else None

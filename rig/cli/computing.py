@@ -115,7 +115,7 @@ def _show_batch(done: "BatchResult") -> None:
         limit = {"hung": ", without the study's time_limit", "memory": ", without the study's memory_limit"}
         say(f"{failure}; to do it alone{limit.get(failure.kind, '')}: {failure.command}")
     if len(batch.failures) > MOST_FAILURES:
-        say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / 'failures.jsonl'}")
+        say(f"and {len(batch.failures) - MOST_FAILURES} more, in {done.folder / batch.failures_file}")
     now = f", in {in_words(batch.wall_s)} with up to {batch.workers} at once" if batch.run else ""
     tell(f"{batch.verdict}: {batch.done} of {batch.total} cases done, {batch.run} of them now{now}")
     if batch.reason:

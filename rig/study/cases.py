@@ -12,30 +12,24 @@ from rig.config.models import AUTO, RigConfig
 from rig.config.overrides import SIMULATED
 from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
-from rig.errors import UsageError, noted
+from rig.errors import DamagedRecordingError, UsageError, noted
 from rig.estimate.registry import FILTERS
-from rig.study.definition import Setting, Study, left_out
+from rig.recording.inputs import holds_frames_alone
+from rig.recording.open import require_recording
+from rig.requests import ReconstructRequest
+from rig.study.definition import KEY_OF, Setting, Study, left_out
 
 ACTIONS: Final = "rig.api.studies.cases"
-_KEY_OF: Final = {
-    "scene": "world.scene",
-    "fog": "world.fog",
-    "exposures": "scan.exposures",
-    "estimator": "estimate.estimator",
-    "filter": "estimate.filter",
-    "min_confidence": "estimate.min_confidence",
-    "temporal_prior": "estimate.temporal_prior",
-}
-"""Keys of the config by the short names of settings."""
 
 
 def cases_of(study: Study) -> list[Case]:
     """The cases of a study whose action is done case by case. Raises UsageError with the problems of all settings."""
     cases: list[Case] = []
     problems: list[str] = []
+    alone: dict[str, bool] = {}
     for setting in study.combinations():
         with noted(problems):
-            made = _reconstruct(study, setting) if study.do == "reconstruct" else _of_rig(study, setting)
+            made = _reconstruct(setting, alone) if study.do == "reconstruct" else _of_rig(study, setting)
             told = {key: setting[key] for key in study.labels if key in setting}
             seeds = study.seeds if study.do != "reconstruct" else study.seeds[:1]  # nothing in it is drawn
             for seed in seeds:
@@ -57,7 +51,7 @@ class _Inputs:
 
 def _of_rig(study: Study, setting: Setting) -> _Inputs:
     """A scan or a calibration of a simulated rig."""
-    overrides = {_KEY_OF.get(key, key): value for key, value in setting.items() if key not in ("config", *_COUNTS)}
+    overrides = {KEY_OF.get(key, key): value for key, value in setting.items() if key not in ("config", *_COUNTS)}
     config = load_config(str(setting.get("config", SIMULATED)), overrides)
     require_simulated(config)
     with open_rig(config) as rig:  # opened to hold the plan against the limits of the devices
@@ -65,7 +59,7 @@ def _of_rig(study: Study, setting: Setting) -> _Inputs:
     content = portable_content(config)
     name, usual = ("maps", 1) if study.do == "scan" else ("poses", 12)
     count = setting.get(name, usual)
-    if not isinstance(count, int) or count < 1:
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise UsageError(f"{name} is {count!r}; it must be a whole number, at least 1")
     return _Inputs({"config": content, name: count}, files_of(content))
 
@@ -73,26 +67,51 @@ def _of_rig(study: Study, setting: Setting) -> _Inputs:
 _COUNTS: Final = "maps", "poses"
 
 
-def _reconstruct(study: Study, setting: Setting) -> _Inputs:
+def _reconstruct(setting: Setting, alone: dict[str, bool]) -> _Inputs:
+    """The reconstruction of a recording. alone: whether the recordings that were looked at before hold frames alone."""
     if "recording" not in setting:
         raise UsageError("reconstruct needs the setting 'recording', the folder of a run or an .npy of frames")
-    problems = []
-    files = tuple(str(Path(setting[key]).absolute()) for key in ("recording", "plan", "calibration") if key in setting)
-    problems += [f"{file} does not exist; correct the path" for file in files if not Path(file).exists()]
-    estimator, filter = setting.get("estimator"), setting.get("filter")
+    paths = {key: setting[key] for key in _FILES if key in setting}
+    asked = {key: value for key, value in setting.items() if key not in paths}
+    problems = [f"{key} is {value!r}; it must be text" for key, value in paths.items() if not isinstance(value, str)]
+    with noted(problems):
+        ReconstructRequest(**asked)
+    if problems:
+        raise UsageError.of(problems)
+    paths = {key: str(Path(value).absolute()) for key, value in paths.items()}
+    problems += [f"{path} does not exist; correct the path" for path in paths.values() if not Path(path).exists()]
+    estimator, filter, least = (asked.get(key) for key in ("estimator", "filter", "min_confidence"))
     if estimator == AUTO:
         problems.append(f"estimator {AUTO!r} depends on the computer; name one, so that the result does not")
     elif estimator is not None and estimator not in estimator_names():
         problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(estimator_names())}")
     if filter is not None and filter not in FILTERS:
         problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+    if least is not None and not 0 <= least <= 1:
+        problems.append(f"min_confidence is {least:g}; it is a probability from 0 to 1")
     if problems:
         raise UsageError.of(problems)
-    paths = {key: str(Path(value).absolute()) for key, value in setting.items() if key in _FILES}
-    return _Inputs({**setting, **paths}, files)
+    recording = paths["recording"]
+    if recording not in alone:
+        alone[recording] = _holds_frames_alone(Path(recording))
+    if alone[recording] and len(paths) < len(_FILES):
+        missing = " and ".join(key for key in _FILES if key not in paths)
+        raise UsageError(f"{recording} holds frames alone; add {missing} to say how they were taken")
+    return _Inputs({**asked, **paths}, tuple(paths.values()))
 
 
-_FILES: Final = "recording", "plan", "calibration"
+_FILES: Final[tuple[str, ...]] = "recording", "plan", "calibration"
+
+
+def _holds_frames_alone(recording: Path) -> bool:
+    """Whether a recording is frames without a plan. Raises UsageError if it cannot be read."""
+    if recording.is_file() and recording.suffix == ".npy":
+        return True
+    require_recording(recording)
+    try:
+        return holds_frames_alone(recording)
+    except DamagedRecordingError as error:
+        raise UsageError(str(error)) from error
 
 
 def require_simulated(config: RigConfig) -> None:

@@ -27,6 +27,16 @@ KEYS: Final[Mapping[Action, tuple[str, ...]]] = {
     "calibrate": ("config", "scene", "exposures", "poses"),
 }
 """Settings of each action. Those that simulate a rig take keys of its config too: `scan.columns`."""
+KEY_OF: Final[Mapping[str, str]] = {
+    "scene": "world.scene",
+    "fog": "world.fog",
+    "exposures": "scan.exposures",
+    "estimator": "estimate.estimator",
+    "filter": "estimate.filter",
+    "min_confidence": "estimate.min_confidence",
+    "temporal_prior": "estimate.temporal_prior",
+}
+"""Keys of the config by the short names of settings."""
 WHOLE: Final[tuple[Action, ...]] = ("tradeoff", "strategies")
 """Actions whose lists are all combined in one table of their own."""
 OF_A_CASE: Final[Mapping[Action, tuple[str, ...]]] = {
@@ -125,6 +135,11 @@ class Study(BaseModel):
             if isinstance(value, list) and "." not in key
         ]
         problems += [f"{key} is under set and under vary; name it once" for key in self.set if key in self.vary]
+        problems += [
+            f"{short} and {key} are the same setting; write it in one way everywhere"
+            for short, key in KEY_OF.items()
+            if short in given and key in given
+        ]
         if self.do in WHOLE and self.also:
             problems.append(f"also is not for {self.do}, which combines all lists; add its values to vary")
         problems += self._problems_of_omit()
@@ -146,6 +161,8 @@ class Study(BaseModel):
                 problems.append(f"omit has {key!r}, but every case of {self.do} has all of them; make two studies")
             elif values and value not in values:
                 problems.append(f"omit has {key} {value!r}, which no case has; {key} is one of {values}")
+            elif not values and (key in apart or "." in key) and self.do not in WHOLE:  # those have usual values
+                problems.append(f"omit has {key}, which no case names; add it to vary, or leave it out of omit")
         return problems
 
     @property

@@ -1,7 +1,8 @@
 """One table, figure and page of any study, made from the folder of its batch.
 
-A line for each case, or for each of the rows that a case returns; a column for each setting that varies and each figure
-of the result. The figure shows the numbers over the setting with the most values that are numbers.
+A line for each case, or for each of the rows that a case returns; a column for each setting that varies, each figure
+of the result and the case's name, which the folder of its kept files has too. The figure shows the numbers over the
+setting with the most values that are numbers.
 """
 
 import statistics
@@ -11,7 +12,8 @@ from typing import Any, Final, TypeGuard
 
 from calibration.errors import digits
 from rig.batch.engine import failure_line
-from rig.batch.store import LIST, Row, read_failures, read_rows
+from rig.batch.store import LIST, Row, failure_files, read_failures, read_rows
+from rig.batch.task import CASE
 from rig.config.bundled import short_names
 from rig.errors import UsageError
 from rig.report.charts import Panel, Series, legend, panel_svg
@@ -46,7 +48,8 @@ def lines_of(rows: Sequence[Row]) -> tuple[list[Line], list[str]]:
         for number, part in enumerate(parts):
             own = {key: value[number] for key, value in measured.items() if _is_of(value, parts)}
             figures = dict(_flat({**result, **part, **own}))
-            lines.append({**settings, **{key: figures[key] for key in figures if key not in settings}})
+            figures = {key: figures[key] for key in figures if key not in settings}
+            lines.append({**settings, **figures, CASE: row.case})
     if any("rows" in row.result for row in rows):  # what tells the rows of a case from each other is a setting too
         labels += [key for key in ("estimator", "filter", "strategy") if lines and key in lines[0]]
     return lines, list(dict.fromkeys(labels))
@@ -69,7 +72,7 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
 def study_report(folder: Path) -> str:
     """The page on a study's folder. Raises UsageError if there is none, or no case is done."""
     rows = list(read_rows(folder))
-    failures = read_failures(folder)
+    failures = read_failures(*failure_files(folder))
     if not rows and not failures:
         raise UsageError(f"{folder} has no finished case yet; run `rig batch` first")
     lines, labels = lines_of(rows)
@@ -80,7 +83,7 @@ def study_report(folder: Path) -> str:
     whole = len(rows) == total
     said = f"{len(rows)} of {total} cases are done"
     verdict = "complete" if whole else "failures" if failures else "part"
-    known = [key for line in lines for key, value in line.items() if value is not None and value != ""]
+    known = [key for line in lines for key, value in line.items() if key != CASE and value is not None and value != ""]
     columns = list(dict.fromkeys([*(label for label in labels if label in known), *known]))
     cells = [[_cell(line.get(key)) for key in columns] for line in lines[:SHOWN_LINES]]
     more = paragraph(f"{len(lines) - SHOWN_LINES} more lines are in table.csv", small=True)

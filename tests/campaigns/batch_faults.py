@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.batch.engine import Executor
-from rig.batch.store import Store, read_failures, read_rows
+from rig.batch.store import Store, failure_files, read_failures, read_rows
 from rig.batch.task import perform
 from rig.errors import UsageError
 from tests.campaigns.batch_run import Spec, run
@@ -395,7 +395,7 @@ def require_right(trial: Trial) -> None:
         raise WrongError("the table is another one than that of an undisturbed batch")
     good = set(range(spec.count)) - set(spec.bad)
     found = {row.labels["x"] for row in read_rows(folder)}
-    failures = {each["labels"]["x"]: each["kind"] for each in read_failures(folder)}
+    failures = {each["labels"]["x"]: each["kind"] for each in read_failures(*failure_files(folder))}
     if failures != {x: KINDS[kind] for x, kind in spec.bad.items()}:
         raise WrongError(f"failures are {failures}, not those of {spec.bad}")
     if found != good:

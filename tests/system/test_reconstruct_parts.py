@@ -54,6 +54,13 @@ def test_what_needs_the_map_before_is_refused_with_the_reason(recording, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+def test_a_scheduler_that_does_not_answer_leaves_no_folder(recording, tmp_path):
+    request = api.ReconstructRequest(out=tmp_path / "maps")
+    with pytest.raises(UsageError, match="no scheduler answers"):
+        api.reconstruct_parts(recording, request=request, cluster="tcp://127.0.0.1:9")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_knock_between_two_parts_is_doubted(recording, tmp_path, monkeypatch):
     monkeypatch.setattr("rig.api.studies.parts.MAPS_OF_A_PART", 2)
     compared = []

@@ -11,14 +11,13 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from rig.api import strategies, tradeoffs
 from rig.batch.case import Case, Result
 from rig.batch.engine import Batch, Executor, probe, run_batch, setting_of
 from rig.batch.pool import Limits, Pool, usual_workers
-from rig.batch.store import Row, Store, read_failures, read_rows
-from rig.batch.task import HEAD
+from rig.batch.store import Row, Store, failure_files, read_failures, read_rows
 from rig.config.overrides import SIMULATED, PathLike
 from rig.errors import UsageError
 from rig.interrupts import one_interrupt
@@ -45,6 +44,13 @@ class BatchResult:
 
     batch: Batch
     folder: Path
+
+    def uninterrupted(self) -> Self:
+        """The result itself, for callers that need the whole study. Raises KeyboardInterrupt if an interrupt ended it,
+        so that it ends a loop over studies too."""
+        if self.batch.verdict == "aborted":
+            raise KeyboardInterrupt
+        return self
 
     def rows(self) -> list[Row]:
         """The finished cases, in order."""
@@ -91,22 +97,15 @@ def batch(
     verdict 'aborted'; everything that is done by then is in the table.
     """
     request = replace(request or BatchRequest(), **changes)
-    loaded = load_study(study)
-    shard = _shard(request.shard)
+    loaded, shard = _checked(study, request)
     if request.out is None:
         raise UsageError("a study is written into a folder; name one with `out`")
-    if request.workers is not None and request.workers < 1:
-        raise UsageError(f"`workers` is {request.workers}; it must be at least 1")
     made = _made(loaded)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     folder = Path(request.out).absolute()
     content = {"study": loaded.model_dump(mode="json")}
     with one_interrupt(), Store(folder, made.cases, content, shared=shard[1] > 1) as store:
-        try:
-            executor = executor_of(request, store, limits, client)
-        except BaseException:
-            store.give_up()
-            raise
+        executor = executor_of(request, store, limits, client)
         command = f"rig batch {_named(study)} --out {shlex.quote(str(request.out))}"
         done = run_batch(
             store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
@@ -122,21 +121,28 @@ def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes:
     A few cases are done, in a folder that is removed again. Raises UsageError as `batch` does, and if one fails.
     """
     request = replace(request or BatchRequest(), **changes)
-    loaded = load_study(study)
+    loaded, shard = _checked(study, request)
+    if request.cluster not in (None, OWN_PROCESSES):
+        raise UsageError("only this computer can say how long cases take; leave `cluster` out")
     made = _made(loaded)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     workers = request.workers or usual_workers(limits)
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-batch-")))
         scratch = stack.enter_context(Store(place / "probe", made.cases))
-        total = len(scratch.cases)
-        left = total
-        if request.out is not None and (Path(request.out) / HEAD).exists():
-            store = stack.enter_context(Store(Path(request.out), made.cases, {"study": loaded.model_dump(mode="json")}))
-            left -= len(store.finished())
+        mine = list(scratch.cases)[shard[0] :: shard[1]]
+        done = set() if request.out is None else scratch.finished_in(Path(request.out))
+        left = len(set(mine) - done)
         tried_s = probe(scratch, Pool(1, limits)) if left else [0.0]
     case_s = statistics.fmean(tried_s)
-    return BatchPlan(total, left, workers, case_s, case_s * left / workers, tuple(tried_s))
+    return BatchPlan(len(mine), left, workers, case_s, case_s * left / workers, tuple(tried_s))
+
+
+def _checked(study: StudyLike, request: BatchRequest) -> tuple[Study, tuple[int, int]]:
+    """A study, and which share of it a request asks for. Raises UsageError."""
+    if request.workers is not None and request.workers < 1:
+        raise UsageError(f"`workers` is {request.workers}; it must be at least 1")
+    return load_study(study), _shard(request.shard)
 
 
 def repeat_case(study: StudyLike, name: str) -> Result:
@@ -202,16 +208,18 @@ def _cases_and_table(study: Study) -> _Made:
     if study.do not in ("tradeoff", "strategies"):
         return _Made(cases_of(study))
     lists: dict[str, list[Any]] = {**{key: [value] for key, value in study.set.items()}, **study.vary}
-    config = lists.pop("config", [SIMULATED])
-    if len(config) != 1:
-        raise UsageError(f"{study.do} takes one config, not {len(config)}; make a study of each")
-    single: dict[str, Any] = {key: lists.pop(key)[0] for key in ("limits", "rows", "lux") if key in lists}
+    alone = {key: lists.pop(key) for key in ("config", "limits", "rows", "lux") if key in lists}
+    for key, values in alone.items():
+        if len(values) != 1:
+            raise UsageError(f"{study.do} takes one value of {key}, not {len(values)}; make a study of each")
+    single: dict[str, Any] = {key: values[0] for key, values in alone.items()}
+    config = single.pop("config", SIMULATED)
     fields = {_FIELDS[key]: [*values] for key, values in lists.items()}
     options: dict[str, Any] = {**single, **fields, "seed": study.seed, "repeat": study.repeat}
     if study.do == "tradeoff":
-        cases, write = tradeoffs.as_cases(config[0], TradeoffRequest(**options))
+        cases, write = tradeoffs.as_cases(config, TradeoffRequest(**options))
     else:
-        cases, write = strategies.as_cases(config[0], StrategiesRequest(**options))
+        cases, write = strategies.as_cases(config, StrategiesRequest(**options))
     kept = kept_cases(cases, study.omit)
 
     def write_kept(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
@@ -229,7 +237,16 @@ _FIELDS = {
 
 
 def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
-    """The executor that a request asks for, for the cases of a store. Raises UsageError."""
+    """The executor that a request asks for, for the cases of a store. Raises UsageError, and leaves the store's folder
+    as it was before."""
+    try:
+        return _executor_of(request, store, limits, client)
+    except BaseException:
+        store.give_up()
+        raise
+
+
+def _executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
     if client is None and request.cluster in (None, OWN_PROCESSES):
         return Pool(request.workers, limits)
     if request.workers is not None:
@@ -242,7 +259,7 @@ def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Cl
 def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
     """Write the table, the page and, for a trade-off, its own files. Old ones are replaced."""
     rows = list(store.rows())
-    if not rows and not read_failures(store.folder):
+    if not rows and not read_failures(*failure_files(store.folder)):
         return
     if rows:
         replace_file(store.folder / "table.csv", csv_of(lines_of(rows)[0]).encode())

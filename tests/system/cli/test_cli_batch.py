@@ -136,6 +136,9 @@ def test_a_study_that_was_interrupted_is_gone_on_with(tmp_path: Path, monkeypatc
     assert counts[-1] == (2, 2)
     assert table(tmp_path / "study") == table(tmp_path / "whole")
     assert api.plan_batch(study, out=tmp_path / "study").left == 0
+    assert rest.uninterrupted() is rest
+    with pytest.raises(KeyboardInterrupt):
+        stopped.uninterrupted()
     with pytest.raises(UsageError, match="was begun with other cases: 2, of which 1 are the same"):
         api.batch({**study, "repeat": 1}, out=tmp_path / "study")
 
@@ -166,6 +169,10 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     planned = rig("batch", "study.yaml", "--out", "study", "--dry-run")
     assert planned.code == 0
     assert "cases: 1, to be done: 1" in planned.out
+    assert "cases: 0, to be done: 0" in rig("batch", "study.yaml", "--dry-run", "--shard", "2/2").out
+    for wrong, said in ("--workers -2", "--workers is -2; it must"), ("--cluster tcp://h:1", "leave --cluster out"):
+        (problem,) = rig("batch", "study.yaml", "--dry-run", *wrong.split()).problems
+        assert said in problem
     assert "since cases that were tried took " in planned.out
     assert not Path("study").exists()
     Path("study").mkdir()
@@ -177,6 +184,8 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     assert (said["verdict"], said["done"]) == ("complete", 1)
     (row,) = map(json.loads, Path("study/table.jsonl").read_text().splitlines()[1:])
     assert (Path("study/files") / row["case"] / "summary.json").exists(), "the case has kept its files"
+    (line,) = csv.DictReader(Path("study/table.csv").read_text().splitlines())
+    assert line["case"] == row["case"]
     alone = rig("batch", "study.yaml", "--out", "study", "--case", row["case"], "--json")
     assert alone.code == 0
     result = json.loads(alone.out)
@@ -193,6 +202,10 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
         ({"do": "strategies", "vary": {"time": ["5 m"]}}, "error: time "),
         ({"do": "strategies", "vary": {"rule": ["fair"]}}, "error: rule has 'fair'; the rules are energy and irr"),
         ({"do": "tradeoff", "set": {"exposures": 60_000}}, "leave out exposures above"),
+        ({"do": "tradeoff", "vary": {"lines": ["two"]}}, "error: lines is ['two']; it must be a list of whole numbers"),
+        ({"do": "tradeoff", "vary": {"limits": [True, False]}}, "takes one value of limits, not 2; make a study of"),
+        ({"do": "strategies", "vary": {"rows": [4, 8]}}, "strategies takes one value of rows, not 2; make a study of"),
+        ({"do": "strategies", "set": {"rows": "few"}}, "error: rows is 'few'; it must be a whole number"),
     ],
 )
 def test_a_wrong_setting_has_its_name_in_the_study(rig: Rig, study: dict[str, Any], said: str) -> None:

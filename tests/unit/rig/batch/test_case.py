@@ -6,7 +6,7 @@ import pytest
 
 from drivers.recorded.contents import INDEX_FILE
 from rig.batch import case as module
-from rig.batch.case import Case, call, changed_file, checksum, code_digest, files_of, package_of
+from rig.batch.case import INSTALLED, Case, call, changed_file, checksum, code_digest, files_of, package_of
 from rig.errors import UsageError
 from tests.unit.rig.batch.executors import TINY
 
@@ -154,6 +154,37 @@ def test_the_digest_of_the_code_sees_our_sources_and_those_of_the_cases(
         assert set(look().values()).isdisjoint(now.values())
     finally:
         code_digest.cache_clear()
+
+
+def test_the_digest_of_the_code_sees_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "foglamp").mkdir()
+    (tmp_path / "foglamp" / "__init__.py").write_text("KIND = 1")
+    about = tmp_path / "foglamp-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Name: foglamp\nVersion: 1.0\n")
+    without = code_digest.__wrapped__("rig")
+    (about / "entry_points.txt").write_text("[spadrig.estimator]\nfoglamp = foglamp:KIND\n")
+    with_it = code_digest.__wrapped__("rig")
+    (tmp_path / "foglamp" / "__init__.py").write_text("KIND = 2")
+    assert len({without, with_it, code_digest.__wrapped__("rig")}) == 3
+
+
+def test_a_case_has_the_same_name_wherever_the_program_is_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of the program count as code, those of others by their content."""
+    names = []
+    for place in ("anna", "ben"):
+        monkeypatch.setattr(module, "TOP", tmp_path / place)
+        (tmp_path / place / "config").mkdir(parents=True)
+        own, foreign = str(tmp_path / place / "config" / "rig.yaml"), str(tmp_path / "mine.yaml")
+        made = Case("builtins:dict", {"config": {"calibration": own, "all": [own, foreign]}}, files=(own, foreign))
+        assert made.files == (foreign,)
+        assert made.call() == {"config": {"calibration": own, "all": [own, foreign]}}
+        assert made.inputs["config"]["all"] == [f"{INSTALLED}/config/rig.yaml", foreign]
+        names.append(made.name("code", {foreign: "sum"}))
+    assert names[0] == names[1]
 
 
 def test_the_package_of_a_function_is_the_first_part_of_its_name() -> None:

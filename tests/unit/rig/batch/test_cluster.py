@@ -92,7 +92,9 @@ def test_a_worker_with_other_code_or_without_a_file_is_named_before_anything_is_
     assert len(lines) == 4
     assert all(line.startswith("worker inproc://") for line in lines)
     assert lines[0].endswith(f"does not see {tmp_path / 'input'}; share it under the same path, with the same content")
-    assert lines[1].endswith("has another version of the code or of its packages; install the same one")
+    assert lines[1].endswith(
+        "has another version of the code, a plugin or a package; install the same one and restart it"
+    )
 
 
 def test_a_folder_that_is_not_shared_or_only_for_reading_is_a_problem(
@@ -160,6 +162,8 @@ def test_a_client_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, clu
         async with distributed.Client(cluster.scheduler_address, set_as_default=False, asynchronous=True) as client:
             refused(client, "asynchronous; open it with")
 
+    refused(cluster, "LocalCluster; give a distributed.Client of the cluster")
+    refused("tcp://127.0.0.1:8786", "str; give")
     closed = distributed.Client(cluster, set_as_default=False)
     closed.close()
     refused(closed, "closed, not connected to its scheduler; open a new one")

@@ -10,8 +10,8 @@ import pytest
 from rig.batch import engine as module
 from rig.batch.case import Case
 from rig.batch.engine import LOST, Batch, in_words, probe, run_batch
-from rig.batch.store import Store, read_failures
-from rig.batch.task import Ended, Status, Task
+from rig.batch.store import Store, failure_files, read_failures
+from rig.batch.task import Ended, Status, Task, result_file
 from rig.errors import RigError, UsageError
 from rig.progress import Step, listening
 from tests.unit.rig.batch.executors import TINY, Inline, squares, troubles
@@ -119,7 +119,7 @@ def test_a_case_whose_process_ended_is_tried_again_as_often_as_allowed(tmp_path:
     (failure,) = done.failures
     assert (failure.case, failure.labels, failure.kind, failure.attempts) == (bad, {"x": 1}, status, 5)
     assert failure.command == f"rig batch s.yaml --case {bad}"
-    (kept,) = read_failures(tmp_path / "out")
+    (kept,) = read_failures(*failure_files(tmp_path / "out"))
     assert (kept["case"], kept["kind"], kept["message"]) == (bad, status, f"it {status}")
 
 
@@ -142,15 +142,46 @@ def test_an_error_of_the_case_is_not_tried_again_but_by_the_next_run(tmp_path: P
     with Store(tmp_path / "out", cases) as store:
         done = run_batch(store, Inline())
     assert (done.verdict, done.run) == ("complete", 1)
-    assert read_failures(tmp_path / "out") == [], "old failures are forgotten"
+    assert read_failures(*failure_files(tmp_path / "out")) == [], "old failures are forgotten"
+
+
+def test_failures_that_were_not_tried_again_are_kept(tmp_path: Path) -> None:
+    def interrupt(task: Task) -> None:
+        raise KeyboardInterrupt
+
+    done = run(tmp_path / "out", Inline(ends("raised")), shard=(0, 2))
+    assert done.failures_file == "failures-1-of-2.jsonl"
+    assert len(read_failures(tmp_path / "out" / done.failures_file)) == 4
+    assert run(tmp_path / "out", Inline(ends("raised"))).failures_file == "failures.jsonl"
+    assert run(tmp_path / "out", Inline(interrupt)).verdict == "aborted"
+    assert len(read_failures(*failure_files(tmp_path / "out"))) == 7
+    assert run(tmp_path / "out").verdict == "complete"
+    assert failure_files(tmp_path / "out") == []
+
+
+def test_a_result_that_cannot_be_read_ends_the_batch_and_the_executor(tmp_path: Path) -> None:
+    def spoil(task: Task) -> None:
+        file = result_file(tmp_path / "out", executor.given[0])
+        if file.is_file():
+            file.unlink()
+            file.mkdir()
+
+    executor = Inline(spoil, workers=1)
+    done = run(tmp_path / "out", executor)
+    assert (done.verdict, done.done) == ("stopped", 7)
+    assert done.reason.endswith("Is a directory; make it readable, then run it again")
+    executor = Inline()
+    with pytest.raises(UsageError, match="make it readable"):
+        run(tmp_path / "out", executor)
+    assert executor.closed
 
 
 def test_failures_of_shards_are_forgotten_once_the_cases_are_done(tmp_path: Path) -> None:
     assert run(tmp_path / "out", Inline(ends("raised")), shard=(0, 2)).verdict == "failures"
     assert run(tmp_path / "out", Inline(ends("raised")), shard=(1, 2)).verdict == "failures"
-    assert len(read_failures(tmp_path / "out")) == 7
+    assert len(read_failures(*failure_files(tmp_path / "out"))) == 7
     assert run(tmp_path / "out").verdict == "complete"
-    assert read_failures(tmp_path / "out") == []
+    assert read_failures(*failure_files(tmp_path / "out")) == []
 
 
 def test_a_lost_connection_is_no_fault_of_the_case_but_not_for_ever(tmp_path: Path) -> None:

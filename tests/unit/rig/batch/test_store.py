@@ -11,7 +11,7 @@ import pytest
 
 from rig.batch import store as module
 from rig.batch.case import Case
-from rig.batch.store import Store, read_failures, read_rows
+from rig.batch.store import Store, failure_files, read_failures, read_rows
 from rig.batch.task import perform, result_file
 from rig.errors import UsageError
 from tests.unit.rig.batch.executors import TINY, squares
@@ -81,6 +81,30 @@ def test_a_torn_result_is_removed_and_done_again(tmp_path: Path) -> None:
         assert len(store.pack()) == 3
 
 
+def test_a_result_that_cannot_be_read_stays_and_is_named(tmp_path: Path) -> None:
+    with Store(tmp_path / "out", squares(2)) as store:
+        do(store, store.names)
+        file = result_file(store.folder, store.names[0])
+        file.unlink()
+        file.mkdir()  # even root cannot read it
+        for read in (store.finished, lambda: list(store.rows()), store.pack):
+            with pytest.raises(UsageError, match=f"^cannot read {file}: Is a directory; make it readable, then run"):
+                read()
+    assert file.exists()
+
+
+def test_finished_cases_are_counted_while_somebody_is_at_work(tmp_path: Path) -> None:
+    with Store(tmp_path / "asks", squares(3)) as asks:
+        assert asks.finished_in(tmp_path / "out") == set()
+        with Store(tmp_path / "out", squares(3)) as store:
+            do(store, store.names[:2])
+            assert asks.finished_in(tmp_path / "out") == set(store.names[:2])
+        with pytest.raises(UsageError, match="has something else in it"):
+            asks.finished_in(tmp_path)
+    with Store(tmp_path / "fewer", squares(2)) as fewer, pytest.raises(UsageError, match="was begun with other cases"):
+        fewer.finished_in(tmp_path / "out")
+
+
 def test_a_result_that_another_shard_writes_meanwhile_is_no_torn_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,9 +137,12 @@ def test_a_folder_of_other_cases_is_refused(tmp_path: Path) -> None:
 
 def test_a_batch_that_is_refused_leaves_the_folder_to_others(tmp_path: Path) -> None:
     """Its workers did not see a file, for example."""
-    with Store(tmp_path / "out", squares(3)) as store:
-        store.give_up()
-    with Store(tmp_path / "out", squares(2)) as store:
+    (tmp_path / "before").mkdir()
+    for folder in ("out", "before"):
+        with Store(tmp_path / folder, squares(3)) as store:
+            store.give_up()
+    assert not (tmp_path / "out").exists(), "it was made for this batch"
+    with Store(tmp_path / "before", squares(2)), Store(tmp_path / "out", squares(2)) as store:
         do(store, store.names)
         store.pack()
     with Store(tmp_path / "out", squares(2)) as store:
@@ -138,7 +165,9 @@ def test_a_folder_of_other_code_or_of_other_packages_is_refused(
 ) -> None:
     Store(tmp_path / "out", squares(3)).close()
     monkeypatch.setattr(module, "code_digest", lambda package: "another")
-    with pytest.raises(UsageError, match=r"was begun with another version of the code; name another folder"):
+    with pytest.raises(
+        UsageError, match=r"was begun with another version of the code or of a plugin; name another folder"
+    ):
         Store(tmp_path / "out", squares(3))
     monkeypatch.setattr(module, "numeric_versions", lambda: {"numpy": "0.1"})
     with pytest.raises(UsageError, match=r"with other versions of packages: .*, here {'numpy': '0.1'}"):
@@ -274,7 +303,7 @@ def test_when_the_disk_is_full_old_table_and_results_stay(tmp_path: Path, monkey
 
 
 def test_failures_of_all_shards_are_read(tmp_path: Path) -> None:
-    assert read_failures(tmp_path) == []
+    assert read_failures(*failure_files(tmp_path)) == []
     (tmp_path / "failures-2-of-3.jsonl").write_text('{"case": "b"}\n')
     (tmp_path / "failures-1-of-3.jsonl").write_text('{"case": "a"}\n{"case": "c"}\n')
-    assert [each["case"] for each in read_failures(tmp_path)] == ["a", "c", "b"]
+    assert [each["case"] for each in read_failures(*failure_files(tmp_path))] == ["a", "c", "b"]

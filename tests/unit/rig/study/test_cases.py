@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from rig.batch.case import Case, files_of
+from rig.batch.case import INSTALLED, Case
 from rig.errors import UsageError
+from rig.kernel_cache import TOP
 from rig.study.cases import cases_of, kept_cases
 from rig.study.definition import load_study
 
@@ -39,8 +41,15 @@ def test_short_names_and_keys_of_the_config_are_set() -> None:
     assert content["scan"]["columns"] == 150
     assert made.inputs["maps"] == 3
     assert made.keeps
-    assert len(made.files) >= 1, "the calibration is read, so its contents are in the name of the case"
-    assert files_of(content) == made.files
+    assert content["calibration"].startswith(INSTALLED), "it lies elsewhere on another computer"
+    assert made.files == (), "its content counts as code"
+
+
+def test_a_calibration_of_ones_own_counts_by_its_content(tmp_path: Path) -> None:
+    for name in ("small.yaml", "small-rig.yaml"):
+        (tmp_path / name).write_bytes((TOP / "config" / name).read_bytes())
+    (made,) = cases(do="scan", set={"config": str(tmp_path / "small.yaml")})
+    assert made.files == (str(tmp_path / "small-rig.yaml"),)
 
 
 def test_poses_of_a_calibration() -> None:
@@ -50,13 +59,22 @@ def test_poses_of_a_calibration() -> None:
 
 
 def test_a_reconstruction_has_no_seed_and_reads_its_recording(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "manifest.json").write_text("{}")
-    recording = str(tmp_path / "run")
-    made = cases(do="reconstruct", set={"recording": recording}, vary={"estimator": ["edge", "joint"]})
+    frames = tmp_path / "frames.npy"
+    np.save(frames, np.zeros((4, 2, 1), np.uint8))
+    for name in ("plan.yaml", "calibration.yaml"):
+        (tmp_path / name).write_text("")
+    taken = {"recording": str(frames), "plan": str(tmp_path / "plan.yaml")}
+    taken |= {"calibration": str(tmp_path / "calibration.yaml")}
+    made = cases(do="reconstruct", set=taken, vary={"estimator": ["edge", "joint"]})
     assert [each.labels for each in made] == [{"estimator": "edge"}, {"estimator": "joint"}]
-    assert made[0].inputs == {"recording": recording, "estimator": "edge"}
-    assert made[0].files == (recording,)
+    assert made[0].inputs == {**taken, "estimator": "edge"}
+    assert made[0].files == tuple(taken.values())
+    with pytest.raises(UsageError, match=r"frames\.npy holds frames alone; add plan and calibration to say how"):
+        cases(do="reconstruct", set={"recording": str(frames)})
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError) as refused:
+        cases(do="reconstruct", vary={"recording": [str(tmp_path / "empty"), str(tmp_path / "plan.yaml")]})
+    assert len(str(refused.value).splitlines()) == 2
 
 
 @pytest.mark.parametrize(
@@ -67,7 +85,11 @@ def test_a_reconstruction_has_no_seed_and_reads_its_recording(tmp_path: Path) ->
         ({"do": "scan", "set": {"config": "small", "scene": "nowhere"}}, "nowhere"),
         ({"do": "scan", "set": {"config": "small", "scan.columns": "wide"}}, "scan.columns"),
         ({"do": "scan", "set": {"config": "lab-emulated"}}, "runs in the host's time"),
+        ({"do": "scan", "set": {"config": "small", "maps": True}}, "maps is True; it must be a whole number"),
         ({"do": "calibrate", "set": {"config": "small", "poses": 1.5}}, "poses is 1.5; it must be a whole number"),
+        ({"do": "reconstruct", "set": {"recording": 20261129}}, "recording is 20261129; it must be text"),
+        ({"do": "reconstruct", "set": {"recording": "/", "min_confidence": "high"}}, "'high'; it must be a number"),
+        ({"do": "reconstruct", "set": {"recording": "/", "min_confidence": 2}}, "a probability from 0 to 1"),
         ({"do": "reconstruct"}, "reconstruct needs the setting 'recording'"),
         ({"do": "reconstruct", "set": {"recording": "/none"}}, "/none does not exist; correct the path"),
         ({"do": "reconstruct", "set": {"recording": "/", "estimator": "auto"}}, "depends on the computer; name one"),

@@ -69,6 +69,26 @@ def test_all_mistakes_are_told_together() -> None:
     assert len(problems_of({"do": "scan", "set": {"poses": 1, "lux": 2}, "omit": [{"poses": 1, "rows": 2}]})) == 3
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"set": {"scan.exposures": 7}, "vary": {"exposures": [3, 4]}},
+        {"set": {"fog": "20m", "world.fog": "50m"}},
+        {"vary": {"scan.exposures": [3, 9], "exposures": [3]}},
+        {"vary": {"exposures": [3, 4]}, "omit": [{"scan.exposures": 3}]},
+    ],
+)
+def test_one_setting_has_one_name(content: dict[str, Any]) -> None:
+    (problem,) = [each for each in problems_of({"do": "scan", **content}) if "same setting" in each]
+    assert problem.endswith("are the same setting; write it in one way everywhere")
+
+
+def test_nothing_is_left_out_that_no_case_names() -> None:
+    (problem,) = problems_of({"do": "scan", "vary": {"exposures": [1]}, "omit": [{"maps": 7}]})
+    assert problem == "study: omit has maps, which no case names; add it to vary, or leave it out of omit"
+    assert load_study({"do": "strategies", "omit": [{"fog": "10m"}]}).omit, "it has usual values"
+
+
 def test_a_file_is_named_in_its_mistakes(tmp_path: Path) -> None:
     (tmp_path / "study.yaml").write_text("do: paint")
     with pytest.raises(UsageError, match=r"study.yaml: do: input should be"):
@@ -106,7 +126,7 @@ def test_a_setting_is_left_out_if_it_has_all_values_of_one_that_is_to_be() -> No
         {
             "do": "scan",
             "vary": {"fog": ["clear", "20m"], "exposures": [1, 3]},
-            "omit": [{"fog": "20m", "exposures": 1}, {"maps": 7}],
+            "omit": [{"fog": "20m", "exposures": 1}],
         }
     )
     assert [(each["fog"], each["exposures"]) for each in study.combinations()] == [

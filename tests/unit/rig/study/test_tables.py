@@ -26,9 +26,9 @@ def row(labels: dict[str, Any], result: dict[str, Any], measured: dict[str, Any]
 
 def test_a_line_has_settings_figures_and_nested_figures() -> None:
     (line,), labels = lines_of([row({"scan.depth_range": ["1 m", "8 m"]}, {"error": 0.5})])
-    assert (line, labels) == ({"scan.depth_range": "1 m; 8 m", "error": 0.5}, ["scan.depth_range"])
+    assert (line, labels) == ({"scan.depth_range": "1 m; 8 m", "error": 0.5, "case": "name"}, ["scan.depth_range"])
     lines, labels = lines_of([row({"fog": "20m", "seed": 1}, {"error": 0.5, "fog": "x", "of": {"a": 1, "b": [1, 2]}})])
-    assert lines == [{"fog": "20m", "seed": 1, "error": 0.5, "of.a": 1, "of.b": "1; 2"}]
+    assert lines == [{"fog": "20m", "seed": 1, "error": 0.5, "of.a": 1, "of.b": "1; 2", "case": "name"}]
     assert labels == ["fog", "seed"]
 
 
@@ -36,8 +36,8 @@ def test_a_case_of_several_rows_has_a_line_for_each_with_its_own_times() -> None
     result = {"rows": [{"estimator": "edge", "error": 1.0}, {"estimator": "joint", "error": 0.5}], "light": 3}
     lines, labels = lines_of([row({"exposures": 3}, result, {"seconds": 9.0, "compute_ms": [1.0, 2.0]})])
     assert lines == [
-        {"exposures": 3, "light": 3, "estimator": "edge", "error": 1.0, "compute_ms": 1.0},
-        {"exposures": 3, "light": 3, "estimator": "joint", "error": 0.5, "compute_ms": 2.0},
+        {"exposures": 3, "light": 3, "estimator": "edge", "error": 1.0, "compute_ms": 1.0, "case": "name"},
+        {"exposures": 3, "light": 3, "estimator": "joint", "error": 0.5, "compute_ms": 2.0, "case": "name"},
     ]
     assert labels == ["exposures", "estimator"]
 
