@@ -1,4 +1,4 @@
-"""What the cases of studies return."""
+"""Figures that the cases of studies return."""
 
 from rig.api.studies.cases import scan_once
 from rig.config.overrides import configure
