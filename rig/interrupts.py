@@ -9,7 +9,7 @@ from contextvars import ContextVar
 ENDING = "SIGTERM", "SIGHUP", "SIGBREAK"
 """Signals that end a program, besides Ctrl-C; no system has all of them."""
 _at_end: ContextVar[ExitStack | None] = ContextVar("_at_end", default=None)
-"""Of the outermost `one_interrupt`: gives the signals back at its end."""
+"""Callbacks of the outermost `one_interrupt`, which give the signals back at its end."""
 
 
 @contextmanager
