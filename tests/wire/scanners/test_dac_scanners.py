@@ -105,6 +105,22 @@ def test_a_host_that_was_busy_too_long_ends_the_run_with_a_fault(kind: Kind) -> 
 
 
 @over_both
+def test_after_a_fault_the_mirror_goes_on_from_the_centre_where_the_board_has_put_it(kind: Kind) -> None:
+    clock = VirtualClock()
+    model = kind.board(clock, kind.late)
+    with opened(kind.name, model, clock, max_point_rate="25 kHz", park=0.6) as (device, plugged):
+        play(device, 100)
+        assert device.status.fault is not None
+        since_s = plugged.now_s()
+        device.park()
+        drive = model.history.command(np.arange(since_s, plugged.now_s(), 1 / 25_000))
+        moved = np.flatnonzero(np.abs(np.diff(drive)) > device.limits.step)
+        assert len(moved) <= 1, "the board itself jumps, once"
+        assert np.abs(drive[moved + 1]).max(initial=0.0) <= STEP, "to the centre"
+        assert abs(drive[-1] - 0.6) <= 3 * STEP
+
+
+@over_both
 def test_a_firmware_that_hangs_ends_the_run_and_lets_itself_be_closed_within_its_deadline(
     kind: Kind, caplog: pytest.LogCaptureFixture
 ) -> None:
