@@ -83,7 +83,7 @@ class Cluster:
         looked: Callable[[], object] | None = None,
     ) -> None:
         if not all(hasattr(client, name) for name in ("submit", "gather", "nthreads")):
-            raise UsageError(f"`client` is {type(client).__name__}; give a distributed.Client of the cluster")
+            raise UsageError(f"client is {type(client).__name__}; give a distributed.Client of the cluster")
         self._store, self._client = store, client
         self._close, self._looked = close, looked
         self._limits = limits or Limits()
@@ -414,9 +414,9 @@ def _require_able(client: "Client", store: Store) -> None:
     """Raise UsageError if the client cannot be used, or if a worker does not see the folder or an input, or has another
     version of the code."""
     if client.asynchronous:
-        raise UsageError("`client` is asynchronous; open it with asynchronous=False")
+        raise UsageError("client is asynchronous; open it with asynchronous=False")
     if client.status != "running":
-        raise UsageError(f"`client` is {client.status}, not connected to its scheduler; open a new one")
+        raise UsageError(f"client is {client.status}, not connected to its scheduler; open a new one")
     head = checksum(str(store.folder / HEAD))
     files = store.checksums
     found = client.run(_problems, str(store.folder), head, files, store.codes, on_error="return")

@@ -155,7 +155,7 @@ def test_a_client_that_has_lost_its_scheduler_for_good_is_an_error(tmp_path: Pat
 
 def test_a_client_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, cluster: Any) -> None:
     def refused(client: Any, said: str) -> None:
-        with Store(tmp_path / "out", squares(1)) as store, pytest.raises(UsageError, match=f"^`client` is {said}"):
+        with Store(tmp_path / "out", squares(1)) as store, pytest.raises(UsageError, match=f"^client is {said}"):
             Cluster(store, client)
 
     async def in_a_loop() -> None:
