@@ -7,7 +7,7 @@ None means the config's value (`rig/config/models.py`). A value of another type 
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import Field, dataclass, field, fields
 from fractions import Fraction
 from numbers import Integral, Real
@@ -99,7 +99,11 @@ def _types_of(request: type) -> Mapping[str, tuple[Any, ...]]:
 def _is_of(value: object, wanted: Any) -> bool:
     if get_origin(wanted) is Sequence:
         of = get_args(wanted)[0]
-        return isinstance(value, Sequence) and not isinstance(value, str) and all(_is_of(each, of) for each in value)
+        if isinstance(value, str) or not isinstance(value, Sequence | Set):
+            return False
+        return all(_is_of(each, of) for each in value)
+    if wanted is bool and type(value).__name__ in ("bool", "bool_"):  # numpy's, which is not imported here
+        return True
     if wanted in (int, float):  # numpy's are numbers too; True is one only by an accident of Python
         return isinstance(value, Integral if wanted is int else Real) and not isinstance(value, bool)
     return isinstance(value, get_origin(wanted) or wanted)
@@ -252,9 +256,10 @@ class BatchRequest(CheckedRequest):
     """All cases of a study, on this computer or on many (`rig batch`)."""
 
     out: str | os.PathLike[str] | None = path_option("folder of the study: new, or to go on with", "none")
-    cluster: str | None = option(
-        None, "local (processes of this computer), tcp://HOST:PORT of a dask scheduler, or a YAML file", unset="local"
-    )
+    cluster: str | os.PathLike[str] | None = option(
+        None, "local (processes of this computer), tcp://HOST:PORT of a dask scheduler, or a YAML file", unset="local",
+        read_as=str | None,
+    )  # fmt: skip
     workers: int | None = option(None, "cases at once on this computer", unset="as cores and memory allow")
     shard: str | None = option(None, "only a share of the cases: 3/10 is the third of ten", unset="all")
 

@@ -50,7 +50,7 @@ class Case:
     from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
     keeps: whether it writes files of its own, into a folder that it gets as the input `keep`.
 
-    Files of the program itself count as code. In inputs, INSTALLED stands for its folder.
+    In inputs and files, INSTALLED stands for the folder of the program itself.
     """
 
     function: str
@@ -62,7 +62,7 @@ class Case:
     def __post_init__(self) -> None:
         """Put INSTALLED in the place of the program's own folder."""
         object.__setattr__(self, "inputs", {key: _with_installed(value) for key, value in self.inputs.items()})
-        object.__setattr__(self, "files", tuple(file for file in self.files if not _is_installed(file)))
+        object.__setattr__(self, "files", tuple(map(_with_installed, self.files)))
 
     def call(self) -> Result:
         """The result, computed here and now. Raises what the function raises."""
@@ -96,7 +96,7 @@ def code_digest(package: str = "rig") -> str:
     folders = [TOP / name for name in OWN_PACKAGES]
     for other in sorted({package, *_plugins()}.difference(OWN_PACKAGES)):
         if (spec := find_spec(other)) is not None:
-            folders += map(Path, list(spec.submodule_search_locations or [spec.origin or ""])[:1])
+            folders += map(Path, spec.submodule_search_locations or [spec.origin or ""])
     for folder in folders:
         for file in sorted(_sources(folder)):
             path = file.relative_to(folder.parent)
@@ -111,20 +111,16 @@ def _plugins() -> set[str]:
     return {entry.module.partition(".")[0] for entry in entries if entry.group.startswith(PLUGIN_GROUPS)}
 
 
-def _is_installed(path: str) -> bool:
-    """Whether a path is of a file of the program itself, whose content `code_digest` knows."""
-    own = any(Path(path).is_relative_to(TOP / name) for name in OWN_PACKAGES)
-    return own and Path(path).suffix in CODE_SUFFIXES
-
-
 def _with_installed(value: Any) -> Any:
     """A plain value with INSTALLED in place of the program's folder, in the paths of its files."""
     if isinstance(value, Mapping):
         return {key: _with_installed(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_with_installed(each) for each in value]
-    if isinstance(value, str) and value.startswith(str(TOP)) and _is_installed(value):
-        return f"{INSTALLED}/{Path(value).relative_to(TOP).as_posix()}"
+    if isinstance(value, str) and value.endswith(CODE_SUFFIXES) and os.path.isabs(value):
+        path, top = Path(os.path.realpath(value)), Path(os.path.realpath(TOP))
+        if any(path.is_relative_to(top / name) for name in OWN_PACKAGES):
+            return f"{INSTALLED}/{path.relative_to(top).as_posix()}"
     return value
 
 
@@ -150,12 +146,13 @@ def numeric_versions() -> dict[str, str]:
 
 
 def checksum(path: str) -> str:
-    """Checksum of a file, or of all files in a folder. Raises UsageError if it cannot be read.
+    """Checksum of a file, or of all files in a folder. INSTALLED may stand in its path. Raises UsageError if it cannot
+    be read.
 
     Of a recording, frames count by the sizes of their files and by the index, and maps that were made of it do not
     count.
     """
-    top = Path(path)
+    top = Path(_here(path))
     try:
         if not top.is_dir():
             return _checksum_of_file(top)
@@ -193,7 +190,7 @@ def changed_file(files: Mapping[str, str]) -> str | None:
 def current_checksum(path: str) -> str:
     """The checksum of a path, which is computed anew only if sizes or times have changed. Raises OSError or
     UsageError."""
-    stats = [(str(each), each.stat()) for each in _watched(Path(path))]
+    stats = [(str(each), each.stat()) for each in _watched(Path(_here(path)))]
     stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     if _known.get(path, ([], ""))[0] != stamp:
         _known[path] = stamp, checksum(path)

@@ -199,8 +199,8 @@ class Cluster:
         """Raise RigError if the client was closed, by its owner or since its scheduler is gone."""
         if self._client.status == "closed":
             raise RigError(
-                "the client was closed, or the scheduler is gone; start it, then run this again: it goes on where it "
-                "stopped"
+                "the client was closed, or the scheduler is gone; open a new client or start the scheduler, then run "
+                "this again: it goes on where it stopped"
             )
 
     def close(self) -> None:
@@ -415,8 +415,8 @@ def _require_able(client: "Client", store: Store) -> None:
     version of the code."""
     if client.asynchronous:
         raise UsageError("client is asynchronous; open it with asynchronous=False")
-    if client.status != "running":
-        raise UsageError(f"client is {client.status}, not connected to its scheduler; open a new one")
+    if client.status in ("closed", "closing"):
+        raise UsageError(f"client is {client.status}; open a new one")
     head = checksum(str(store.folder / HEAD))
     files = store.checksums
     found = client.run(_problems, str(store.folder), head, files, store.codes, on_error="return")
@@ -443,5 +443,7 @@ def _problems(folder: str, head: str, files: Mapping[str, str], codes: Mapping[s
     if os.path.isdir(folder) and not os.access(folder, os.W_OK):
         problems.append(f"cannot write {folder}; share it for writing")
     if any(code_digest(package) != code for package, code in codes.items()):
-        problems.append("has another version of the code, a plugin or a package; install the same one and restart it")
+        problems.append(
+            "has another version of the code, a plugin or a package; install the same one and restart the worker"
+        )
     return problems

@@ -87,7 +87,7 @@ class Batch:
     verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, whose other cases are done elsewhere),
     'stopped' (results could not be written any more, or the code has changed; `reason` says why), or 'aborted' by an
     interrupt. packed: whether the table has been written; of several shards the last one does it. failures_file: name
-    of the file with all failures, in the batch's folder.
+    of the file with the failures, those of a shard alone, in the batch's folder.
     """
 
     done: int
@@ -144,7 +144,7 @@ def run_batch(
                 aborted = True
             except Exception as error:  # the table is written all the same
                 _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
-            there, packed = _packed(store, runs, only=shard[1] == 1)
+            there, packed = _packed(store, runs, finished, only=shard[1] == 1)
     done, total = len(there), len(store.cases)
     for name in runs.done - there:
         runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
@@ -162,10 +162,11 @@ def run_batch(
         if aborted or runs.stopped:  # those that failed before and were not tried again
             again = {*there, *runs.failed}
             listed += [line for line in read_failures(*before) if line["case"] not in again]
-        for old in before:
-            old.unlink()
         if listed:
             replace_file(file, "".join(map(json_line, listed)).encode())
+        for old in before:
+            if old != file or not listed:
+                old.unlink()
     verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
     if aborted:
         verdict = "aborted"
@@ -181,10 +182,10 @@ def run_batch(
     )  # fmt: skip
 
 
-def _packed(store: Store, runs: "_Runs", *, only: bool) -> tuple[set[str], bool]:
+def _packed(store: Store, runs: "_Runs", finished: set[str], *, only: bool) -> tuple[set[str], bool]:
     """Write the table, if no other shard is at work; returns the finished cases of all shards, and whether the table
-    has been written. only: whether there is no other shard."""
-    there = set(runs.done)
+    has been written. finished: those that were there before. only: whether there is no other shard."""
+    there = finished | runs.done
     try:
         # While the folder is shared nobody packs. Listed again once alone, for what others have done meanwhile.
         if not only:
@@ -192,7 +193,6 @@ def _packed(store: Store, runs: "_Runs", *, only: bool) -> tuple[set[str], bool]
         if only or (store.alone() and len(there := store.finished()) == len(store.cases)):
             return store.pack(), True
     except OSError as error:
-        there = store.finished()
         runs.stopped = f"cannot write {store.folder}: {error.strerror}; make room, then run it again"
     except UsageError as error:
         runs.stopped = str(error)

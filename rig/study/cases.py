@@ -105,7 +105,7 @@ _FILES: Final[tuple[str, ...]] = "recording", "plan", "calibration"
 
 def _holds_frames_alone(recording: Path) -> bool:
     """Whether a recording is frames without a plan. Raises UsageError if it cannot be read."""
-    if recording.is_file() and recording.suffix == ".npy":
+    if recording.is_file():
         return True
     require_recording(recording)
     try:

@@ -221,8 +221,9 @@ def _anchored_all(setting: Setting, folder: Path) -> Setting:
 
 
 def _anchored(key: str, value: Any, folder: Path) -> Any:
-    if key not in PATHS or not isinstance(value, str):
+    if key not in PATHS or not isinstance(value, str | os.PathLike):
         return value
+    value = os.fspath(value)
     path = folder / os.path.expanduser(value)
     name = key in NAMES and Path(value).name == value and not value.endswith((".yaml", ".yml"))
     # A folder may have the name of a config by chance: that of the results, for example. Some are scenes.

@@ -65,9 +65,9 @@ class BatchResult:
 class BatchPlan:
     """The work that a study would be.
 
-    cases, left: number of all cases, and of those without a result. workers: cases at once, on this computer. case_s:
-    mean wall time of a case in seconds, with one thread, found by trying a few. tried_s: time of each that was tried.
-    wall_s: of all that are left.
+    cases, left: number of all cases, those of the shard if the request names one, and of those without a result.
+    workers: cases at once, on this computer. case_s: mean wall time of a case in seconds, with one thread, found by
+    trying a few. tried_s: time of each that was tried. wall_s: of all that are left.
     """
 
     cases: int

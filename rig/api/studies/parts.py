@@ -49,7 +49,7 @@ def reconstruct_parts(
     calibration: PathLike | None = None,
     request: ReconstructRequest | None = None,
     *,
-    cluster: str | None = None,
+    cluster: PathLike | None = None,
     workers: int | None = None,
     client: "Client | None" = None,
     progress: Progress | None = None,

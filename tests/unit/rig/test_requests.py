@@ -45,4 +45,4 @@ def test_another_type_is_one_line_for_each_field(values: dict[str, Any], lines: 
 
 def test_numbers_of_numpy_paths_and_tuples_are_taken() -> None:
     StrategiesRequest(rows=np.int32(4), lux=np.float32(2.0), exposures=(np.int64(3),), out=Path("out"), lines=[2])
-    ScanRequest(maps=None, min_confidence=1, tags=("fog",))
+    ScanRequest(maps=None, min_confidence=1, tags={"fog"}, record=np.bool_(True))  # type: ignore[arg-type]

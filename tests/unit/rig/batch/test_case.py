@@ -8,6 +8,7 @@ from drivers.recorded.contents import INDEX_FILE
 from rig.batch import case as module
 from rig.batch.case import INSTALLED, Case, call, changed_file, checksum, code_digest, files_of, package_of
 from rig.errors import UsageError
+from rig.kernel_cache import TOP
 from tests.unit.rig.batch.executors import TINY
 
 SQUARE = Case(f"{TINY}:square", {"x": 3, "sleep_s": 0.0}, {"x": 3})
@@ -173,18 +174,30 @@ def test_the_digest_of_the_code_sees_plugins(tmp_path: Path, monkeypatch: pytest
 def test_a_case_has_the_same_name_wherever_the_program_is_installed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Files of the program count as code, those of others by their content."""
     names = []
     for place in ("anna", "ben"):
         monkeypatch.setattr(module, "TOP", tmp_path / place)
         (tmp_path / place / "config").mkdir(parents=True)
         own, foreign = str(tmp_path / place / "config" / "rig.yaml"), str(tmp_path / "mine.yaml")
         made = Case("builtins:dict", {"config": {"calibration": own, "all": [own, foreign]}}, files=(own, foreign))
-        assert made.files == (foreign,)
+        assert made.files == (f"{INSTALLED}/config/rig.yaml", foreign)
         assert made.call() == {"config": {"calibration": own, "all": [own, foreign]}}
         assert made.inputs["config"]["all"] == [f"{INSTALLED}/config/rig.yaml", foreign]
-        names.append(made.name("code", {foreign: "sum"}))
+        (tmp_path / place / "config" / "rig.yaml").write_text("x: 1")
+        sums = {made.files[0]: checksum(made.files[0]), foreign: "sum"}
+        names.append(made.name("code", sums))
+        assert changed_file({made.files[0]: sums[made.files[0]]}) is None
+        (tmp_path / place / "config" / "rig.yaml").write_text("x: 2")
+        assert changed_file({made.files[0]: sums[made.files[0]]}) == made.files[0], "its content counts"
     assert names[0] == names[1]
+
+
+def test_a_file_outside_the_program_is_not_taken_for_its_own(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("x: 1")
+    around = f"{TOP}/config/../{'../' * len(TOP.parts)}{tmp_path}/rig.yaml"
+    made = Case("builtins:dict", {"calibration": around}, files=(around,))
+    assert made.inputs["calibration"] == around
+    assert made.files == (around,)
 
 
 def test_the_package_of_a_function_is_the_first_part_of_its_name() -> None:

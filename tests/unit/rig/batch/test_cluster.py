@@ -93,7 +93,7 @@ def test_a_worker_with_other_code_or_without_a_file_is_named_before_anything_is_
     assert all(line.startswith("worker inproc://") for line in lines)
     assert lines[0].endswith(f"does not see {tmp_path / 'input'}; share it under the same path, with the same content")
     assert lines[1].endswith(
-        "has another version of the code, a plugin or a package; install the same one and restart it"
+        "has another version of the code, a plugin or a package; install the same one and restart the worker"
     )
 
 
@@ -149,7 +149,7 @@ def test_a_client_that_has_lost_its_scheduler_for_good_is_an_error(tmp_path: Pat
         executor = Cluster(store, own)
         own.close()
         assert (executor.room, executor.workers) == (0, 0)
-        with pytest.raises(RigError, match="the scheduler is gone; start it, then run this again"):
+        with pytest.raises(RigError, match="the scheduler is gone; open a new client or start the"):
             run_batch(store, executor)
 
 
@@ -166,7 +166,7 @@ def test_a_client_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, clu
     refused("tcp://127.0.0.1:8786", "str; give")
     closed = distributed.Client(cluster, set_as_default=False)
     closed.close()
-    refused(closed, "closed, not connected to its scheduler; open a new one")
+    refused(closed, "closed; open a new one")
     asyncio.run(in_a_loop())
 
 

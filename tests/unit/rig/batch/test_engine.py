@@ -145,7 +145,7 @@ def test_an_error_of_the_case_is_not_tried_again_but_by_the_next_run(tmp_path: P
     assert read_failures(*failure_files(tmp_path / "out")) == [], "old failures are forgotten"
 
 
-def test_failures_that_were_not_tried_again_are_kept(tmp_path: Path) -> None:
+def test_failures_that_were_not_tried_again_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(task: Task) -> None:
         raise KeyboardInterrupt
 
@@ -154,6 +154,14 @@ def test_failures_that_were_not_tried_again_are_kept(tmp_path: Path) -> None:
     assert len(read_failures(tmp_path / "out" / done.failures_file)) == 4
     assert run(tmp_path / "out", Inline(ends("raised"))).failures_file == "failures.jsonl"
     assert run(tmp_path / "out", Inline(interrupt)).verdict == "aborted"
+    assert len(read_failures(*failure_files(tmp_path / "out"))) == 7
+
+    def full(*given: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "replace_file", full)
+        assert run(tmp_path / "out", Inline(ends("cannot write"))).verdict == "stopped"
     assert len(read_failures(*failure_files(tmp_path / "out"))) == 7
     assert run(tmp_path / "out").verdict == "complete"
     assert failure_files(tmp_path / "out") == []

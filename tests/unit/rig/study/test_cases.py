@@ -42,7 +42,7 @@ def test_short_names_and_keys_of_the_config_are_set() -> None:
     assert made.inputs["maps"] == 3
     assert made.keeps
     assert content["calibration"].startswith(INSTALLED), "it lies elsewhere on another computer"
-    assert made.files == (), "its content counts as code"
+    assert made.files == (content["calibration"],)
 
 
 def test_a_calibration_of_ones_own_counts_by_its_content(tmp_path: Path) -> None:
@@ -69,6 +69,8 @@ def test_a_reconstruction_has_no_seed_and_reads_its_recording(tmp_path: Path) ->
     assert [each.labels for each in made] == [{"estimator": "edge"}, {"estimator": "joint"}]
     assert made[0].inputs == {**taken, "estimator": "edge"}
     assert made[0].files == tuple(taken.values())
+    in_python = cases(do="reconstruct", set={key: Path(value) for key, value in taken.items()})
+    assert in_python[0].inputs == taken
     with pytest.raises(UsageError, match=r"frames\.npy holds frames alone; add plan and calibration to say how"):
         cases(do="reconstruct", set={"recording": str(frames)})
     (tmp_path / "empty").mkdir()
