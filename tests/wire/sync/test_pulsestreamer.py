@@ -433,24 +433,35 @@ def test_answers_in_all_forms_of_http_are_read_and_others_are_errors(pieces: Ite
 
 
 class WaitedTime:
-    """Time that passes only while something is waited for. In place of the module `time`, and of a selector."""
+    """Time that passes only while its maker's thread waits for something. In place of the module `time`, and of a
+    selector. For other threads, such as one of an earlier test that ends late, time passes as ever."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
+        self._thread = threading.current_thread()
+
+    @property
+    def _is_asked(self) -> bool:
+        return threading.current_thread() is self._thread
 
     def monotonic(self) -> float:
-        return self.now_s
+        return self.now_s if self._is_asked else time.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        self.now_s += seconds
+        if self._is_asked:
+            self.now_s += seconds
+        else:
+            time.sleep(seconds)
 
     def selector(self) -> selectors.BaseSelector:
-        time = self
+        waited = self
 
         class Selector(selectors.SelectSelector):
             def select(self, timeout: float | None = None) -> list[Any]:
+                if not waited._is_asked:
+                    return super().select(timeout)
                 ready = super().select(0)
-                time.now_s += 0 if ready else timeout or 0
+                waited.now_s += 0 if ready else timeout or 0
                 return ready
 
         return Selector()
