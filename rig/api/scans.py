@@ -11,7 +11,7 @@ from calibration.files.rig_file import load_rig_model
 from calibration.model.rig_model import RigModel
 from drivers.replay.pace import Pace
 from rig.api.steering import OnMap, Steering, note
-from rig.config.estimators import estimator_names, is_estimator
+from rig.config.estimators import estimator_names
 from rig.config.files import load_cube_plan
 from rig.config.models import AUTO, CubePlan, EstimateConfig, RigConfig
 from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_problems
@@ -19,7 +19,7 @@ from rig.devices.calibration_use import calibration_use, cube_calibration_use
 from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.devices.prepare import prepare, require_memory
 from rig.errors import UsageError, noted
-from rig.estimate.registry import FILTERS
+from rig.estimate.registry import estimate_problems
 from rig.live.feed import Feed
 from rig.live.record_wish import followed
 from rig.plan.scan_plan import ScanPlan
@@ -303,14 +303,7 @@ def _estimate(request: ReconstructRequest) -> EstimateConfig:
     """The settings of the estimate for frames alone, which have no config. Raises UsageError."""
     estimator, filter = request.estimator or AUTO, request.filter or "none"
     min_confidence = 0.5 if request.min_confidence is None else request.min_confidence
-    problems = []
-    if not is_estimator(estimator):
-        known = ", ".join((AUTO, *estimator_names()))
-        problems.append(f"estimator {estimator!r} is unknown; choose one of {known}")
-    if filter not in FILTERS:
-        problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
-    if not 0 <= min_confidence <= 1:
-        problems.append(f"min_confidence is {min_confidence:g}; it is a probability from 0 to 1")
+    problems = estimate_problems(estimator, filter, min_confidence, (AUTO, *estimator_names()))
     if problems:
         raise UsageError.of(problems)
     content = {"estimator": estimator, "filter": filter, "min_confidence": min_confidence}

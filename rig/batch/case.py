@@ -113,15 +113,22 @@ def _plugins() -> set[str]:
 
 def _with_installed(value: Any) -> Any:
     """A plain value with INSTALLED in place of the program's folder, in the paths of its files."""
-    if isinstance(value, Mapping):
-        return {key: _with_installed(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, str):
+        if not (value.endswith(CODE_SUFFIXES) and os.path.isabs(value)):
+            return value
+        path, top = os.path.realpath(value), _real(TOP)
+        if path.startswith(top + os.sep) and Path(inside := path.removeprefix(top + os.sep)).parts[0] in OWN_PACKAGES:
+            return f"{INSTALLED}/{Path(inside).as_posix()}"
+    elif isinstance(value, list | tuple):
         return [_with_installed(each) for each in value]
-    if isinstance(value, str) and value.endswith(CODE_SUFFIXES) and os.path.isabs(value):
-        path, top = Path(os.path.realpath(value)), Path(os.path.realpath(TOP))
-        if any(path.is_relative_to(top / name) for name in OWN_PACKAGES):
-            return f"{INSTALLED}/{path.relative_to(top).as_posix()}"
+    elif isinstance(value, Mapping):
+        return {key: _with_installed(each) for key, each in value.items()}
     return value
+
+
+@functools.cache
+def _real(top: Path) -> str:
+    return os.path.realpath(top)
 
 
 def _here(value: Any) -> Any:

@@ -148,6 +148,20 @@ def create_estimator(
     return {"argmax": Peaks(False, threads), "edge": Peaks(True, threads)}[name]
 
 
+def estimate_problems(
+    estimator: str | None, filter: str | None, min_confidence: float | None, known: Sequence[str]
+) -> list[str]:
+    """A line for each of these settings that cannot be; None is not given. known: the estimators that may be named."""
+    problems = []
+    if estimator is not None and estimator not in known:
+        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(known)}")
+    if filter is not None and filter not in FILTERS:
+        problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
+    if min_confidence is not None and not 0 <= min_confidence <= 1:
+        problems.append(f"min_confidence is {min_confidence:g}; it is a probability from 0 to 1")
+    return problems
+
+
 def is_coupled(name: str) -> bool:
     """Whether neighbours influence each other's answers: that they agree is then no further evidence. Raises UsageError
     as `create_estimator` does."""

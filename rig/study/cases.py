@@ -13,7 +13,7 @@ from rig.config.overrides import SIMULATED
 from rig.devices.open import open_rig
 from rig.devices.prepare import prepare
 from rig.errors import DamagedRecordingError, UsageError, noted
-from rig.estimate.registry import FILTERS
+from rig.estimate.registry import estimate_problems
 from rig.recording.inputs import holds_frames_alone
 from rig.recording.open import require_recording
 from rig.requests import ReconstructRequest
@@ -83,12 +83,8 @@ def _reconstruct(setting: Setting, alone: dict[str, bool]) -> _Inputs:
     estimator, filter, least = (asked.get(key) for key in ("estimator", "filter", "min_confidence"))
     if estimator == AUTO:
         problems.append(f"estimator {AUTO!r} depends on the computer; name one, so that the result does not")
-    elif estimator is not None and estimator not in estimator_names():
-        problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(estimator_names())}")
-    if filter is not None and filter not in FILTERS:
-        problems.append(f"filter {filter!r} is unknown; choose one of {', '.join(FILTERS)}")
-    if least is not None and not 0 <= least <= 1:
-        problems.append(f"min_confidence is {least:g}; it is a probability from 0 to 1")
+        estimator = None
+    problems += estimate_problems(estimator, filter, least, estimator_names())
     if problems:
         raise UsageError.of(problems)
     recording = paths["recording"]
