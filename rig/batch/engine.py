@@ -177,7 +177,7 @@ def run_batch(
     else:
         verdict = "complete" if packed else "part"
     return Batch(
-        done, total, len(runs.done), failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
+        done, total, runs.n_done, failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
         runs.most, tuple(executor.notes), packed, file.name,
     )  # fmt: skip
 
@@ -221,7 +221,9 @@ class _Runs:
         self.attempts: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
         self.failed: dict[str, Ended] = {}
-        self.done: set[str] = set()
+        # Made at once: a set of names that come back from workers would take more memory with each case.
+        self._is_done = dict.fromkeys(names, False)
+        self.n_done = 0
         self.times_s = array("d")
         self.most = 0
         self.stopped = ""
@@ -238,6 +240,11 @@ class _Runs:
                 self._end(ended)
             yield
 
+    @property
+    def done(self) -> set[str]:
+        """Names of the cases that are done."""
+        return {name for name, done in self._is_done.items() if done}
+
     def tries(self, name: str) -> int:
         """Number of times that a case was tried, or else lost."""
         return self.attempts[name] or self._lost[name]
@@ -252,7 +259,8 @@ class _Runs:
             return
         self.times_s.append(ended.seconds)
         if ended.status == "done":
-            self.done.add(name)
+            self._is_done[name] = True
+            self.n_done += 1
             return
         if ended.status == "lost":
             self._lost[name] += 1
@@ -287,8 +295,8 @@ class _Told:
         if now_s - self._said_s < SAID_S and not over:
             return
         self._said_s = now_s
-        done = self._before + len(runs.done)
-        ended = len(runs.done) + len(runs.failed)
+        done = self._before + runs.n_done
+        ended = runs.n_done + len(runs.failed)
         notes = []
         if ended and not over:
             left_s = (now_s - self._begun_s) / ended * (len(runs.waiting) + len(runs.under_way))
@@ -327,7 +335,7 @@ def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
     runs = _Runs(scratch, executor, some, 0)
     try:
         for _ in runs.steps():
-            tell_stage("trying cases, which load compiled code first", len(runs.done), len(some), "done")
+            tell_stage("trying cases, which load compiled code first", runs.n_done, len(some), "done")
     finally:
         executor.close()
     if runs.failed:
