@@ -1,7 +1,10 @@
 """The engine runs each case until it has a result or has failed, and writes the table on every way out."""
 
+import json
 import os
 import signal
+import tracemalloc
+from array import array
 from collections.abc import Callable
 from pathlib import Path
 
@@ -331,6 +334,23 @@ def test_an_end_that_comes_twice_counts_once(tmp_path: Path) -> None:
 
     done = run(tmp_path / "out", Twice())
     assert (done.run, done.done, done.verdict) == (7, 7, "complete")
+
+
+def test_memory_does_not_grow_with_the_cases_that_are_done(tmp_path: Path) -> None:
+    """Names that come back are new strings each time, as those from another process are."""
+    traced = array("q")
+
+    def done(task: Task) -> Ended:
+        traced.append(tracemalloc.get_traced_memory()[0])
+        return Ended(json.loads(json.dumps(task.name)), "done")
+
+    tracemalloc.start()
+    try:
+        run(tmp_path / "out", Inline(done), count=800)
+    finally:
+        tracemalloc.stop()
+    assert len(traced) == 800
+    assert traced[-1] - traced[200] < 30 * 600
 
 
 def test_progress_counts_finished_cases_and_says_what_is_amiss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
