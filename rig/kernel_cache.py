@@ -131,9 +131,10 @@ def _digest(data: bytes) -> str:
 def _serves(folder: Path) -> bool:
     """Whether a folder can be written to, and is on a disk of this computer. If it does not exist, the nearest existing
     folder above it decides."""
-    while not folder.exists() and folder != folder.parent:
+    # `Path.exists` raises an error where a folder above may not be searched.
+    while not os.path.exists(folder) and folder != folder.parent:
         folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK) and file_system_of(folder) not in NETWORK
+    return os.path.isdir(folder) and os.access(folder, os.W_OK) and file_system_of(folder) not in NETWORK
 
 
 def file_system_of(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:

@@ -68,6 +68,12 @@ def test_the_users_own_setting_stays(monkeypatch, tmp_path):
     assert os.environ[kernel_cache.VARIABLE] == str(tmp_path)
 
 
+def test_a_folder_that_cannot_be_asked_for_counts_as_not_there(monkeypatch, tmp_path):
+    """As one below a folder that may not be searched; a name that is too long is refused to root, too."""
+    monkeypatch.setattr(kernel_cache, "file_system_of", lambda folder: "ext4")
+    assert kernel_cache._serves(tmp_path / ("x" * 300) / "cache")
+
+
 @pytest.fixture
 def tree(tmp_path):
     """Packages in which `rig.a` imports `rig.deep.b`, which imports `rig.deep.c`; `rig.d` imports nothing."""
