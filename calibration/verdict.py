@@ -101,11 +101,11 @@ def unguided(verdict: Verdict) -> Verdict:
 
 
 def more_poses(shown: int, what: str, found: tuple[float, float], asked: float, said: Callable[[float], str]) -> Reason:
-    """The reason if data are simply too few. The text estimates how many poses would be enough, or says that more will
-    not do if these exceed MOST_POSES. It does neither if the error is not finite.
+    """The reason if data are simply too few. The text estimates how many poses would be enough. If these are more than
+    MOST_POSES, it says instead that more poses will not do. If the error is not finite, the text has no estimate.
 
     shown: number of poses so far. what: words for the error, with the verb. found: median and 95th percentile of the
-    error over the picture; the text names the one that exceeds its limit more. asked: limit of the median, that of the
+    error over the picture; the text names the one that exceeds its limit more. asked: limit of the median; that of the
     percentile is WORST_TIMES as large. said: turns an error into text.
     """
     over = [error / limit for error, limit in zip(found, (asked, WORST_TIMES * asked), strict=True)]

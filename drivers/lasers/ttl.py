@@ -1,11 +1,11 @@
 """A laser without a protocol: switched on, set and switched off by hand, and modulated by its TTL input.
 
-Nothing can be asked or told, so all of `status` is what the driver assumes: the laser is on, at the config's power, and
-shines whenever the gate is high. `emission` is therefore always True, `interlock_closed` and `key_on` are None, and
-`armed` only means that whoever started the scan was told. Neither `pause` nor `disarm` nor `close` changes the light,
-which `gate_only` says to the program. The only way to end it by software is a low gate: a scan whose sync source cannot
-read its gate back low is refused, as with any laser. Use a laser whose light is off while its TTL input is open, or a
-pull-down.
+The laser takes no commands and gives no answers, so all of `status` is what the driver assumes: the laser is on, at the
+config's power, and shines whenever the gate is high. `emission` is therefore always True, `interlock_closed` and
+`key_on` are None, and `armed` only means that a warning was logged when the scan started. `pause`, `disarm` and `close`
+do not change the light, so `gate_only` is True. The only way to end it by software is a low gate: a scan whose sync
+source cannot read its gate back low is refused, as with any laser. Use a laser whose light is off while its TTL input
+is open, or a pull-down.
 """
 
 import logging

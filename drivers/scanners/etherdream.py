@@ -141,8 +141,8 @@ class EtherDreamDac:
         return 0.0
 
     def take_over(self) -> PointStream:
-        """Stop holding the mirror and return the stream that still holds it for up to `HOLD_S`; a prepared one if the
-        board is idle. Raises the error that ended the holding, if one did."""
+        """End the thread that holds the mirror, and return its stream, whose queued points hold it for up to `HOLD_S`
+        more. If the board is idle, the stream is a new one. Raises the error that ended the holding, if one did."""
         if (fault := self._let_go()) is not None:
             raise fault
         if self._stream is None:

@@ -274,8 +274,8 @@ class NidaqDac:
         task.do_channels.add_do_chan(self.lines, line_grouping=self.card.const.LineGrouping.CHAN_FOR_ALL_LINES)
 
     def release(self) -> None:
-        """End a run's tasks, if there are any, the mirror's last, and take the markers low. The mirror keeps its
-        level."""
+        """End all tasks of a run but the mirror's, take the markers low, then end the mirror's. Without a run, only
+        take the markers low. The mirror keeps its level."""
         with self.card.errors(), ExitStack() as steps:
             steps.callback(self.card.clear)
             steps.callback(self.dark)

@@ -185,7 +185,8 @@ class NiCard:
             raise
 
     def nearest_clock(self, task: Any, wanted_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The rate nearest to `wanted_hz`, within the limits, to which the sample clock of a task can be set."""
+        """Set a task's sample clock to the rate nearest to `wanted_hz` that its divider makes within the limits, and
+        return that rate. A card that does not state its timebase is set to `wanted_hz`, whatever the limits are."""
         clock_hz = self.tune(task, Fraction(wanted_hz))
         base_hz = self._timebase(task)
         if base_hz is None:

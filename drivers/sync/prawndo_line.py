@@ -111,10 +111,11 @@ class PrawnDoLine:
         self.command("ndb")
 
     def transact(self, command: str, deadline_s: float | None = None, *, urgent: bool = False) -> list[str]:
-        """Send a command; returns the lines of its answer without blank ones.
+        """Send a command and return the lines of its answer, without blank ones.
 
-        urgent: whether the command is part of taking the outputs low. Meanwhile all other commands end with
-        `DeviceFault`. Also raises `DeviceTimeout` or `ProtocolError`.
+        deadline_s: longest wait for the answer; None means the usual one. urgent: whether the command is part of taking
+        the outputs low. Any other command raises `DeviceFault` if `lower` interrupts it. Raises `DeviceTimeout` if no
+        answer comes, and `ProtocolError` if the beginning of the answer is missing.
         """
         deadline_s = self._timing.reply_s if deadline_s is None else deadline_s
         with self.lock:

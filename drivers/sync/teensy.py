@@ -136,8 +136,9 @@ class Teensy(SerialDevice, SyncBoard):
         return cls(config_of(TeensyConfig, port=port, watchdog_s=watchdog_s), surroundings or alone())
 
     def ask(self, command: str) -> str:
-        """Send a raw command, once, and return the board's answer, also if it is an error. Nothing is checked: `run`
-        can raise the gate, and nobody feeds its watchdog. Raises `DeviceError` if no answer comes."""
+        """Send a raw command, once, and return the board's answer, also if it is an error. The command is not checked:
+        the raw command `run` can raise the gate, and no thread feeds the board's watchdog then. Raises `DeviceError` if
+        no answer comes."""
         self._require("ask", *OPEN_STATES)
         self._note_raw(command)
         return self._line.ask(command, _ANY)[0]

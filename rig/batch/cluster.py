@@ -2,9 +2,9 @@
 
 A case returns only its name and how it ended; results are files in a folder that all workers must see. So a worker that
 is lost takes nothing with it. One scheduler takes a few hundred tasks a second; therefore quick cases are sent in
-parcels, some cases as one task. Each thread of a dask worker has a process of its own for the cases, which can be ended
-when a case hangs or takes too much memory. A worker with another version of the code, or without the folder, is retired
-as soon as it shows; its cases go to others.
+parcels, several cases as one task of dask. Each thread of a dask worker has a process of its own for the cases, which
+can be ended when a case hangs or takes too much memory. A worker with another version of the code, or without the
+folder, is retired as soon as it shows; its cases go to others.
 """
 
 import contextlib
@@ -142,7 +142,8 @@ class Cluster:
 
     @property
     def room(self) -> int:
-        """Number of tasks that it takes now."""
+        """Number of cases that may be submitted now; 0 without a connection to the scheduler, and negative after
+        workers have gone."""
         if self._client.status != "running":
             return 0
         return max(1, AHEAD * self.workers) * self._size - self._under_way

@@ -1,21 +1,20 @@
 """The fog meter: density of the medium, light that it scatters, and ambient light, from the counts of a single map.
 
-Rows of a column whose stripe is beyond doubt (clear rows) show the light before and behind the stripe. With s the mean
-of the path lengths from scanner and camera in metres, and G the geometry factor of the haze
-(`rig.estimate.row.inputs`),
+Rows of a column whose stripe is beyond doubt (clear rows) show the light before and behind the stripe. Maximum
+likelihood fits this light to the counts, binned by s (sums (blocks, 2, bins, 4) of `rig.depth.kernels`):
 
     flux = ambient + offset + haze G exp(-2 extinction s)           before the stripe
          = ambient + offset + rest haze G exp(-2 extinction s)      behind it
 
-is fitted by maximum likelihood of the counts, binned by s (sums (blocks, 2, bins, 4) of `rig.depth.kernels`). The
-parameters are haze, extinction, the share `rest` of the haze that was scattered more than once, and `offset`, the error
-of the learned ambient light.
+Here s is the mean of the path lengths from scanner and camera in metres, and G the geometry factor of the haze
+(`rig.estimate.row.inputs`). The parameters are haze, extinction, the share `rest` of the haze that was scattered more
+than once, and `offset`, the error of the learned ambient light.
 
-Standard deviations are those of the sandwich, H^-1 (sum of g g^T) H^-1, with H the information of the counts and g the
-likelihood's slope from each block of rows and columns, but at least those of H^-1. What the model leaves out shows as
-scatter between blocks; the sandwich is a jackknife to first order. One error shows in no scatter: light scattered more
-than once flattens the decay all over the picture. Therefore REST_SHARE times `rest` is added (in quadrature) to the
-extinction's relative error.
+Standard deviations come from the sandwich estimator, H^-1 (sum of g g^T) H^-1, which holds even if the model is a
+little wrong: what it leaves out shows as scatter between blocks. H is the information of the counts, and g the
+likelihood's slope from each block of rows and columns. They are at least those of H^-1. One error shows in no scatter:
+light scattered more than once flattens the decay all over the picture. Therefore REST_SHARE times `rest` is added (in
+quadrature) to the extinction's relative error.
 
 Limits. A reading depends only on its map and on the model with which the map was estimated; no reading is carried over
 to the next map. If the fog forms a halo around the stripes (`halo` of the model), its light falls off on both sides of

@@ -82,7 +82,8 @@ def _compiled(rig: OpenRig, scan: ScanConfig) -> ScanPlan:
 
 
 BURST_LEAD_S, HOST_LEAD_S = 5e-3, 0.15
-"""Seconds between the SPAD's start and the first scan marker for which a burst must have room.
+"""Seconds between the SPAD's start and the first scan marker. A SPAD that records bursts starts to fill its memory
+then, so the memory needs room for the frames of that time too.
 
 The first is for virtual time, the second for a host that starts one device after the other over USB and serial ports.
 """
@@ -95,7 +96,7 @@ They are added if the memory has room and the SPAD has markers: reading then end
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Seconds before the first scan marker for which a burst must have room."""
+    """Seconds between the SPAD's start and the first scan marker, whose frames a burst must have room for."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 

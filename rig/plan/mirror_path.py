@@ -230,7 +230,8 @@ class PathFound:
 
 
 def find_path(demand: PathDemand, limits: ScannerLimits, point_clock: Callable[[float], Fraction]) -> PathFound:
-    """Find the quickest path within the limits, on the fastest point clock at which the scanner can hold all points."""
+    """Find the quickest path within the limits. The point clock is the fastest, to about 2 %, at which all points fit
+    into the scanner's memory. point_clock: the exact rate that the scanner makes of a requested one."""
     low_hz, high_hz = limits.point_rate_hz
     asked = high_hz
     sweeps = 2 if demand.bidirectional else 1

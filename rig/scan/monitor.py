@@ -68,8 +68,9 @@ class ScanProgress:
 
     frames: frames received, at most frames_planned. frames_planned: number that the plan takes from the first scan
     marker to the last.
-    lost: frames lost by the SPAD's own count; if it has none, those that found no room in the ring.
-    sweeps: sweeps counted, of `maps`.
+    lost: number of lost frames, as the SPAD counts them; for a SPAD without such a count, those that found no room in
+    the ring.
+    sweeps: number of sweeps counted so far. maps: number of maps that were asked for.
     stages: the figures of each stage so far. ring_used: slots of the ring in use at this moment.
     fog: estimate from the newest map; None before the first.
     stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while other maps are made

@@ -70,7 +70,7 @@ class Strategy(Protocol):
 
     @property
     def light(self) -> Light:
-        """Part of the scene that its source lights at a time."""
+        """The part of the scene that is lit at one time."""
         ...
 
     @property

@@ -130,12 +130,12 @@ class StatisticalLimit:
 def limits(
     lights: Sequence[RowLight], exposures: Sequence[int], *, averaged: int = 1, draws: int = 32, seed: int = 0
 ) -> list[StatisticalLimit]:
-    """Compute the limit of each number of exposures over some rows of a scene; the same seed gives the same limit.
+    """Compute the limit at each number of exposures, over some rows of a scene; the same seed gives the same limit.
 
     averaged: number of rows of equal disparity that are seen together; 1 for an estimator of single rows.
-    draws: per row. 200 rows take a second for four numbers of exposures, and EXPONENT_ROWS of them a second for their
-      exponents.
-    Raises ValueError without rows.
+    draws: number of random sets of counts for each row. 200 rows take a second for four numbers of exposures; the
+      exponents of EXPONENT_ROWS rows take another.
+    Raises ValueError if there are no rows.
     """
     if not lights:
         raise ValueError("a limit needs at least one row of light")

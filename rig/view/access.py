@@ -99,7 +99,8 @@ class Access:
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def refusal(self, asked: Asked) -> Refused | None:
-        """The reason why a request is not answered, or None. `brings_token`: whether its address has the token."""
+        """The reason why a request is not answered, or None if it is. Host and Origin are checked first, then the
+        token, which comes in a cookie or in the address."""
         if len(asked.hosts) != 1 or not self._is_here(asked.hosts[0]):
             return Refused(421, "This page answers only to this computer's own name or number.")
         if len(asked.origins) > 1 or (asked.socket and not asked.origins):

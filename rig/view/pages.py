@@ -1,10 +1,10 @@
 """The open pages: what each is told over its web socket, and what it asks for.
 
-A page is told the newest value of each topic. A page that reads slowly misses older ones, and so costs the viewer one
-message a topic, however long it hangs. A page that sends too much, or what no page of ours sends, is cut off.
+A page is told the newest value of each topic. A page that reads slowly misses older ones, so at most one message for
+each topic waits for it, however long it hangs. A page that sends too much, or what no page of ours sends, is cut off.
 
-A message to a page is binary: uint32 (little-endian) length of a JSON text, the text, and the bytes of a picture, if
-any. The JSON has the key `topic`. A message from a page is JSON with the key `ask`, one of `WISHES`.
+A message to a page is binary: the length of a JSON text in bytes (uint32, little-endian), the text, and the bytes of a
+picture, if any. The JSON has the key `topic`. A message from a page is JSON with the key `ask`, one of `WISHES`.
 """
 
 import asyncio
@@ -150,7 +150,7 @@ class Pages:
         return taken, list(self._following.values())
 
     async def serve(self, connection: "ServerConnection") -> None:
-        """Serve one page until it goes."""
+        """Serve one page until its connection is closed. A page that sends too much, or no wish of ours, is cut off."""
         self._last_number += 1
         page = _Page(self._last_number, dict(self._newest))
         page.news.set()

@@ -62,7 +62,8 @@ def view(
     run: folder of a run, with or without recording; None shows the running scan, and waits for one.
     request, changes: options, as a `ViewRequest` or by the names of its fields.
     ready: called with the page's address, token included, once it can be opened.
-    Raises UsageError if there is nothing to show, viser is not installed, or the page cannot be served there.
+    Raises UsageError if there is nothing to show, viser is not installed, the page cannot be served at the address
+    that was asked for, or an option is out of range.
     """
     request = replace(request or ViewRequest(), **changes)
     _require_sizes(request)

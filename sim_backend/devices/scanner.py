@@ -46,7 +46,8 @@ class SimulatedScannerConfig(KindConfig):
 
 
 class SimulatedScanner(BeamScanner):
-    """Tells the bench, the state that simulated devices share, where the mirror goes."""
+    """The simulated galvo scanner. It tells the bench, the state that all simulated devices share, where the mirror
+    goes."""
 
     def __init__(self, config: SimulatedScannerConfig, bench: Bench) -> None:
         super().__init__("simulated scanner")

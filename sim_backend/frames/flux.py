@@ -57,7 +57,8 @@ class FluxModel:
         return fewer
 
     def add_sheet(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt from the sheet to `rate`, rows first_row..last_row-1. Releases the GIL."""
+        """Add detections per second and watt from the sheet to rows first_row to last_row - 1 of `rate` (rows, width).
+        Releases the GIL."""
         for effect in self.laser.values():
             effect.add(sheet, first_row, last_row, rate)
 

@@ -118,7 +118,7 @@ class SensorBits:
     """
 
     def __init__(self, flux: FluxModel, rows: NDArray[np.int64], frame_s: float) -> None:
-        """frame_s: exposure and period of a frame."""
+        """rows: image rows that are simulated. frame_s: exposure and period of a frame, in seconds."""
         sensor, names = flux.setting.sensor, flux.bits
         times = FrameTimes(frame_s, frame_s)
         self._after = self._blind = 0.0

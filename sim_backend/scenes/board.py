@@ -44,8 +44,8 @@ class BoardAtPose:
     mirrored: bool = False
 
     def trace(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """(depth of the board's plane in m, albedo) along rays (u, v); albedo NaN where a ray misses the board or meets
-        its back."""
+        """(z of the board's plane in m, albedo) where rays (u, v, 1) meet it. The albedo is NaN where a ray misses the
+        board or meets its back; z means nothing there."""
         turn, position = self.pose.matrix, np.asarray(self.pose.position_m, np.float64)
         with np.errstate(all="ignore"):
             along = turn[0, 2] * u + turn[1, 2] * v + turn[2, 2]
