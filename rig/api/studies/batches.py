@@ -240,20 +240,16 @@ def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Cl
     """The executor that a request asks for, for the cases of a store. Raises UsageError, and leaves the store's folder
     as it was before."""
     try:
-        return _executor_of(request, store, limits, client)
+        if client is None and request.cluster in (None, OWN_PROCESSES):
+            return Pool(request.workers, limits)
+        if request.workers is not None:
+            raise UsageError("`workers` is for this computer; a cluster has the workers that were started for it")
+        from rig.batch.cluster import Cluster, connect
+
+        return connect(str(request.cluster), store, limits) if client is None else Cluster(store, client, limits)
     except BaseException:
         store.give_up()
         raise
-
-
-def _executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
-    if client is None and request.cluster in (None, OWN_PROCESSES):
-        return Pool(request.workers, limits)
-    if request.workers is not None:
-        raise UsageError("`workers` is for this computer; a cluster has the workers that were started for it")
-    from rig.batch.cluster import Cluster, connect
-
-    return connect(str(request.cluster), store, limits) if client is None else Cluster(store, client, limits)
 
 
 def _write_tables(store: Store, made: _Made, aborted: bool) -> None:
