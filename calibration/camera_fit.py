@@ -34,9 +34,8 @@ _POSE = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations. matrix: (p, p) float64, J^T J of the camera's parameters with all poses free; in pixels and
-    each parameter's own unit.
-    """
+    """Normal equations of a camera. names: (p,) its parameters. matrix: (p, p) float64, J^T J after elimination of all
+    poses; J: derivatives of the corners' pixels by the parameters, each in its own unit."""
 
     names: tuple[str, ...]
     matrix: Array

@@ -40,7 +40,8 @@ def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[A
 
 
 def by_parameter(model: RigModel, names: tuple[str, ...], measure: Callable[[RigModel], Array]) -> Array:
-    """(n, p) derivatives of measure(model) (n,) by the parameters `names`, from differences."""
+    """Derivatives (n, p) of `measure(model)`, an array (n,), by the parameters `names`, from central differences. They
+    are one-sided at a bound, such as a lag of 0, and NaN for a parameter that the model does not have."""
     slopes = np.empty((measure(model).size, len(names)))
     for i, name in enumerate(names):
         step = _STEPS.get(name, _STEP)

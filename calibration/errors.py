@@ -44,7 +44,7 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def condition_text(condition: float) -> str:
-    """A condition number, of which the power of ten matters: '3.1e+07'; 'inf' if it is not finite."""
+    """The text of a condition number with two digits and a power of ten, as '3.1e+07'; 'inf' if it is not finite."""
     return f"{condition:.1e}" if np.isfinite(condition) else "inf"
 
 

@@ -1,4 +1,4 @@
-"""Quantities with units in config files: text such as "10 us" on disk, an SI number in code.
+"""Quantities with units in config files: text such as "10 us" on disk, a number in code (SI; rates of rain in m/h).
 
 A field typed `Seconds` takes text such as "10 us" and nothing else. A bare number, another dimension, NaN and infinity
 are refused. Values written back (`model_dump(mode="json")`) are text again and read back to the very same number.
@@ -115,8 +115,8 @@ def parse_exact(text: object, dimension: str) -> Fraction:
 
 
 def parse_fraction(text: object) -> Fraction:
-    """The fraction of which `str` made a text, such as "100000/3". Raises ValueError for anything else: Fraction itself
-    reads 1e999999999 too, which takes minutes and gigabytes."""
+    """Parse a fraction of whole numbers, such as "100000/3" or "-5". Raises ValueError for anything else, and for a
+    number of more than 1000 digits: `Fraction` alone would read "1e999999999", which takes minutes and gigabytes."""
     if not isinstance(text, str) or _FRACTION.fullmatch(text) is None:
         raise ValueError(f"{_shown(text)} is no fraction of whole numbers")
     return Fraction(text)

@@ -206,8 +206,8 @@ def register(
 ) -> tuple[NDArray[np.int32], Array, Array]:
     """Fit the corners `ids` near where the map puts them; return ids, px (n, 2) and sd_px (n,) of those found.
 
-    reach: half width of the patches, in squares. search: whether to search in whole pixels first.
-    """
+    reach: half width of the patches, in squares, but at least 4 and at most 16 pixels. search: whether to search in
+    whole pixels first."""
     places = _places(drawing, board_map, ids, reach)
     found = [_register_one(picture, drawing, place, search) for place in places]
     good = np.array([one is not None for one in found], np.bool_)

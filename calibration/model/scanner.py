@@ -40,8 +40,10 @@ class Scanner(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """Planes at increasing commands (n,), interpolated linearly. rows: (n, 4) nx, ny, nz, d in metres; they are scaled
-    to |n| = 1. Raises CalibrationError for numbers that are no such table."""
+    """Planes n.X = d at strictly increasing commands (columns,), interpolated linearly. rows: (columns, 4) nx, ny, nz,
+    d, with d in metres. They are kept scaled to |n| = 1, with signs such that neighbouring normals point the same way
+    and nx is not negative on average. Raises CalibrationError for another shape, for commands that do not increase, for
+    a number that is not finite and for a normal of 0."""
 
     command: Array
     rows: Array

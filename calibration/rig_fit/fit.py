@@ -1,10 +1,11 @@
-"""Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag, from corners and passages together.
+"""Bundle adjustment of a whole rig: camera, poses of the board, mirror and lag are fitted together.
 
-Start values come from linear fits (`rig_state`), the best values from robust least squares (`solve`) with a noise
-estimated from the residuals themselves (`noise`). Each round (`Rounds`) fits, examines the residuals, and ends with at
-most one decision (`misfit`): a mirror term that the data require is added, a lag below 0 is fixed at 0, or a view that
-does not fit the others is no longer used. A lag that the sweeps' speeds and directions do not determine is not fitted.
-The covariance covers all parameters jointly.
+The data are corners of the board in pictures, and passages: mirror commands at which the line crosses a pixel. Start
+values come from linear fits (`rig_state`), the best values from robust least squares (`solve`) with a noise estimated
+from the residuals themselves (`noise`). Each round (`Rounds`) fits, examines the residuals, and ends with at most one
+decision (`misfit`): a mirror term that the data require is added, a lag below 0 is fixed at 0, or a view that does not
+fit the others is no longer used. A lag more than 5 standard deviations below 0 raises Degenerate. A lag that the
+sweeps' speeds and directions do not determine is not fitted. The covariance covers all fitted parameters jointly.
 """
 
 from collections.abc import Sequence
@@ -163,14 +164,16 @@ def sweep_fits(seen: rig_state.Sighting, residual: Array, timing: Array) -> tupl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFit:
-    """A fitted rig. Per view, in the order of `views`: poses, corner_residual_px (n, 2) predicted minus seen, sweeps.
+    """A fitted rig. Of each view, in the order of `views`: poses; corner_residual_px, (n, 2), predicted minus seen; and
+    sweeps.
 
     left_out: names of views without enough corners; outliers: names of views that do not fit the others and were not
     used. noise: estimated from the residuals; corner_scale: median sd of the corners as a multiple of
     `noise.corner_sd_px`. misfit: factor by which variances were multiplied, 1 if the model describes everything.
     condition: condition number of the scaled equations of the free parameters. converged: False if the last fit did
     not converge, as with contradictory data. decisions: about terms and lags. free: the fitted parameters; the names of
-    one group share a value. information: (free, free), the inverse of their covariance before `misfit.widening`.
+    one group share a value. information: (groups, groups), the inverse of the covariance of the groups in `free`. This
+    covariance includes the factor `misfit`, but not what `calibration.rig_fit.misfit.widening` adds.
     """
 
     model: RigModel

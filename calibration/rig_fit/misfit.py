@@ -101,8 +101,10 @@ def best(decisions: Sequence[TermDecision]) -> int | None:
 def lag_decisions(
     solution: RigSolution, problem: RigProblem, free: Sequence[Sequence[str]], timing: Array, determined: bool
 ) -> list[TermDecision]:
-    """The decisions on the lags that are still free; one for both if they share a value, or if the sweeps' directions
-    and speeds do not determine them.
+    """The decisions on the lags that are still free: one for each lag, or one for both if they share a value.
+
+    timing: (3,), both lags and the row delay in seconds. determined: whether the sweeps' directions and speeds
+    determine the lags. If not, one more decision says that the lag was not fitted and keeps its value; its sd is NaN.
     """
     spread = np.sqrt(np.diag(solution.covariance(problem.tie)))
     decisions = []

@@ -42,8 +42,11 @@ def known_row_delay(base: RigModel) -> tuple[float, float]:
 
 
 def with_lags(base: RigModel, fit: SyncFit) -> tuple[RigModel, Reason | None]:
-    """The model with the lags of `fit`, which were fitted with the model's `known_row_delay`; and the reason why its
-    mirror's angle cannot be right then, or None.
+    """`base` with the lags of `fit`, its range of speeds and, if the sweeps determined it, its row delay; and the
+    reason why the mirror's angle cannot be right with these lags, or None.
+
+    fit: made with `fit_sync(sweeps, *known_row_delay(base))`. If `base` has a covariance, the covariance and the other
+    parameters change too, as the module describes.
     """
     assert fit.row_told or fit.row_delay_s == base.row_delay_s, "lags of another row delay"
     told, spread = _told(fit)

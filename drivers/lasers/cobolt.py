@@ -83,8 +83,8 @@ class CoboltFraming:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """The words of one of the laser's command languages. Those in `digital`, `analog` and `set_power` lack their
-    value."""
+    """The words of one of the laser's command languages. The commands in `digital`, `analog` and `set_power` are sent
+    with a space and a value after them; the queries are complete."""
 
     mode: str
     """Query of the mode; the answer has the form `mode_form`."""
@@ -217,9 +217,9 @@ class CoboltLaser(SerialLaser):
     ) -> "CoboltLaser":
         """Open a laser by itself, without a config file.
 
-        port, settings (serial_number, baud): as in `CoboltConfig`. max_power_w: most power that may ever be
-        sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
-        `DeviceError` if the laser cannot be opened.
+        port, settings (serial_number, baud): as in `CoboltConfig`. max_power_w: most power in watts that the laser may
+        ever emit. surroundings: clock, tap and emulated ports; None: the system's clock and real ports only. Raises
+        `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the laser cannot be opened.
         """
         return create(config_of(CoboltConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 

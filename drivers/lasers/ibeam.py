@@ -151,9 +151,9 @@ class IbeamLaser(SerialLaser):
     ) -> "IbeamLaser":
         """Open a laser by itself, without a config file.
 
-        port, settings (serial_number, baud): as in `IbeamConfig`. max_power_w: most power that may ever be sent out.
-        surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError`
-        if the laser cannot be opened.
+        port, settings (serial_number, baud): as in `IbeamConfig`. max_power_w: most power in watts that the laser may
+        ever emit. surroundings: clock, tap and emulated ports; None: the system's clock and real ports only. Raises
+        `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the laser cannot be opened.
         """
         return create(config_of(IbeamConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 

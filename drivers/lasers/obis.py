@@ -206,9 +206,10 @@ class ObisLaser(SerialLaser):
     ) -> "ObisLaser":
         """Open a laser by itself, without a config file.
 
-        port, settings (channel, serial_number, baud): as in `ObisConfig`. max_power_w: most power that may ever be
-        sent out. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible, other
-        `DeviceError` if the laser cannot be opened.
+        port, settings (channel, serial_number, baud): as in `ObisConfig`. max_power_w: most power in watts that the
+        laser may ever emit. surroundings: clock, tap and emulated ports; None: the system's clock and real ports only.
+        Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the laser cannot be
+        opened.
         """
         return create(config_of(ObisConfig, port=port, max_power_w=max_power_w, **settings), surroundings or alone())
 

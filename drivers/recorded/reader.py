@@ -238,7 +238,8 @@ def is_of_run(header: BlockHeader, other: BlockHeader) -> bool:
 
 
 def usual_header(headers: Sequence[BlockHeader]) -> BlockHeader:
-    """The first of those headers that have the most frequent run id, size and clock."""
+    """The first header among those with the most frequent combination of run id, sizes and clock. Raises ValueError if
+    there are no headers."""
     kinds = Counter(map(_run_kind, headers))
     return max(headers, key=lambda header: kinds[_run_kind(header)])
 

@@ -87,7 +87,9 @@ def table_bytes(sizes: Sequence[tuple[int, int]]) -> bytes:
 
 
 def unpack_frame(packed: Bytes, size: int) -> Bytes:
-    """The `size` plain bytes of one frame. Raises CorruptBlock if it does not state that size or cannot be unpacked."""
+    """Unpack one zstd frame, uint8 (bytes,), that holds `size` plain bytes; returns these, read-only. Raises
+    CorruptBlock if the frame does not state that size or cannot be unpacked, and ProtocolError if the package zstandard
+    is not installed."""
     zstandard = zstandard_or_error()
     raw = packed.tobytes()
     try:

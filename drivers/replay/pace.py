@@ -61,8 +61,11 @@ class PaceReport:
 
 
 class Pace:
-    """Lets blocks pass when they are due. `step`, `run_on` and `halt` may be called from any thread, all else from the
-    source thread."""
+    """Lets blocks pass when they are due.
+
+    `step`, `run_on` and `halt` may be called from any thread. `start` is called by the thread that starts the SPAD;
+    `wait`, `wait_for_step` and `hold` by the source thread, which calls the SPAD's `fill`. The other members may be
+    used from any thread; `report` is exact once the run has ended."""
 
     def __init__(self, what: ReplayClock, clock: Clock) -> None:
         self.speed = what.speed
@@ -119,7 +122,8 @@ class Pace:
             self._changed.notify_all()
 
     def wait_for_step(self, timeout_s: float) -> bool:
-        """Wait for an allowed step and take it. False if none was allowed in time or the run was stopped."""
+        """Wait up to `timeout_s` for an allowed step and take it. Returns True at once if frames do not wait for steps,
+        as after `run_on`, and False if no step was allowed in time or the run was stopped."""
         with self._changed:
             self._changed.wait_for(lambda: self._steps > 0 or self._run_on or self.halted, timeout_s)
             if self.halted or not (self._run_on or self._steps):

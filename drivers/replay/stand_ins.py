@@ -1,6 +1,7 @@
-"""Stand-ins for the scanner, laser and sync source of a recording, whose effect is in the frames already.
+"""Stand-ins for the scanner, laser and sync source of a recorded run, whose frames already show what these did.
 
-They accept every call, within wide limits, and do nothing: nothing moves or emits light.
+They accept every call within wide limits, but move nothing and emit no light. Only their states follow the calls: the
+scanner counts as moving for as long as its waveform would take.
 """
 
 from collections.abc import Sequence

@@ -279,8 +279,9 @@ class Spad512s(SpadArray):
         """Connect to a SPAD512S by itself, without a config file.
 
         port, settings (rotation, trigger, burst_frames, width_in_command): as in `Spad512sConfig`. max_frame_rate_hz:
-        None for that of the 512 x 512 sensor. surroundings: of an emulator. Raises `LimitExceeded` for a setting that
-        is not possible, other `DeviceError` if the device cannot be reached.
+        None for that of the 512 x 512 sensor. surroundings: clock, tap and emulated ports; None: the system's clock and
+        real ports only. Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the
+        device cannot be reached.
         """
         config = config_of(Spad512sConfig, port=port, max_frame_rate_hz=max_frame_rate_hz, **settings)
         return create(config, surroundings or alone())

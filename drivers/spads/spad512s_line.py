@@ -146,7 +146,9 @@ class Spad512sLine:
         return self._open().receive_into(view, wait_s)
 
     def rest(self) -> bytes:
-        """Read what the program still sends of a run; returns its last bytes."""
+        """Read and drop what the program still sends of a run, until it is silent for 0.2 s, at most for
+        `Deadlines.stop_s`. Returns the last 64 KiB of it, whose end says whether the run has ended. Raises
+        `DeviceDisconnected` if the connection is gone."""
         return self._open().drain(4 * QUIET_S, self._deadlines.stop_s)
 
     def leave_run(self) -> None:

@@ -107,9 +107,10 @@ class SpbUsb(SpadArray):
     ) -> "SpbUsb":  # fmt: skip
         """Open an SPB1 SPAD by itself, without a config file.
 
-        port, chip: as in `SpbUsbConfig`. heartbeat_s: time without a call of `fill` after which the device ends
-        a run. settings: reads, test_pattern, as in `SpbUsbConfig`. surroundings: of an emulator. Raises `LimitExceeded`
-        for a setting that is not possible, other `DeviceError` if the device cannot be opened.
+        port, chip: as in `SpbUsbConfig`. heartbeat_s: time without a call of `fill` after which the device ends a run.
+        settings: reads, test_pattern, as in `SpbUsbConfig`. surroundings: clock, tap and emulated ports; None: the
+        system's clock and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another
+        `DeviceError` if the device cannot be opened.
         """
         config = config_of(SpbUsbConfig, port=port, chip=chip, heartbeat_s=heartbeat_s, **settings)
         return create(config, surroundings or alone())

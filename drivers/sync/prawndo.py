@@ -182,8 +182,9 @@ class PrawnDo(SerialDevice, SyncBoard):
         """Open a board by itself, without a config file.
 
         port, settings (gate_output, frame_output, marker_output): as in `PrawnDoConfig`. external_clock_hz: of the
-        clock on GPIO20, None for the board's own. surroundings: of an emulator. Raises `LimitExceeded` for a setting
-        that is not possible, other `DeviceError` if the board cannot be opened.
+        clock on GPIO20, None for the board's own. surroundings: clock, tap and emulated ports; None: the system's clock
+        and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the
+        board cannot be opened.
         """
         config = config_of(PrawnDoConfig, port=port, external_clock_hz=external_clock_hz, **settings)
         return cls(config, surroundings or alone())

@@ -162,8 +162,9 @@ class PulseStreamer(SyncBoard):
         """Open a box by itself, without a config file.
 
         port, settings (clock, hold, frame_output, gate_output, marker_output): as in `PulseStreamerConfig`. silence_s:
-        the longest silence of the box while a program runs. surroundings: of an emulator. Raises `LimitExceeded` for a
-        setting that is not possible, other `DeviceError` if the box cannot be opened.
+        the longest silence of the box while a program runs. surroundings: clock, tap and emulated ports; None: the
+        system's clock and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another
+        `DeviceError` if the box cannot be opened.
         """
         config = config_of(PulseStreamerConfig, port=port, silence_s=silence_s, **settings)
         return cls(config, surroundings or alone())

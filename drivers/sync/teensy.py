@@ -127,11 +127,12 @@ class Teensy(SerialDevice, SyncBoard):
 
     @classmethod
     def open(cls, port: str, *, watchdog_s: float = WATCHDOG_S, surroundings: Surroundings | None = None) -> "Teensy":
-        """Open a board by itself, without a config file.
+        """Open a board by itself, without a config file. This takes all its outputs low.
 
         port: as in `TeensyConfig`. watchdog_s: time after which the outputs go low if the board hears nothing while it
-        plays, 0.2 to 60 s. surroundings: of an emulator. Raises `LimitExceeded` for a setting that is not possible,
-        other `DeviceError` if the board cannot be opened.
+        plays, 0.2 to 60 s. surroundings: clock, tap and emulated ports; None: the system's clock and real ports only.
+        Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the board cannot be
+        opened.
         """
         return cls(config_of(TeensyConfig, port=port, watchdog_s=watchdog_s), surroundings or alone())
 

@@ -46,7 +46,8 @@ def devices() -> "list[Attached]":
 def laser_off(config: Config = SIMULATED) -> list[str]:
     """Set the gate low, disarm the laser, and return lines that say what was done (`rig laser off`).
 
-    Raises DevicesError if a device fails or does not answer, or if the laser can only be switched off by hand.
+    Both are tried even if one fails. Raises DevicesError if a device fails or does not answer, or if the laser can only
+    be switched off by hand; UsageError if the config has problems; DeviceError if the config's world cannot be made.
     """
     from rig.devices.doctor import laser_off as switch_off
 

@@ -93,7 +93,8 @@ class Pool:
         return [f"processes that were replaced: {', '.join(said)}"] if said else []
 
     def submit(self, task: Task) -> None:
-        """Begin a task; only if there is room."""
+        """Begin a task, in a new process if none is free. Call it only if there is room. Raises OSError if the system
+        refuses another process."""
         if self._free:
             process = self._free.pop()
         else:

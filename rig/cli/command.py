@@ -329,7 +329,8 @@ def say_space(space: "Space") -> None:
 
 
 def say(line: str) -> None:
-    """Print a line for people to stderr."""
+    """Print a line for people to stderr, with settings named as options (`in_options`) and control characters shown as
+    escapes (`plain`)."""
     print(plain(in_options(line)), file=sys.stderr, flush=True)
 
 

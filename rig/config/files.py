@@ -147,9 +147,10 @@ def _keys(dotted: Iterable[str]) -> frozenset[Key]:
 
 
 def portable_content(config: RigConfig) -> dict[str, Any]:
-    """A config as plain values that have the same meaning in a file of any folder: every path in it is absolute.
+    """A config as plain values that have the same meaning in a file of any folder: every path in it is absolute. Text
+    of devices and world that begins with ~ is left as it is.
 
-    The paths of a loaded config are absolute or relative to the working directory.
+    Relative paths of `config` count from the working directory.
     """
     content: dict[str, Any] = config.model_dump(mode="json")
     here = Path.cwd()

@@ -292,8 +292,8 @@ class BlankingSync:
     def mark(self, block: FrameBlock, records: NDArray[np.void]) -> None:
         """Fill marks, line and sweep of the block's `records` (n,).
 
-        Raises DeviceFault if the frames or the time (`SEARCH_S`) end before two patterns one sweep apart are found.
-        """
+        Raises DeviceFault if the frames end, or `SEARCH_S` and the time of three sweeps have passed, before two
+        patterns one sweep apart are found."""
         header, n = block.header, block.n_frames
         self._count(block)
         records["line"] = 0

@@ -1,7 +1,8 @@
 """Counts of one image row beside those of a whole sweep, for people who watch a run.
 
-Estimators that judge a column as soon as it is complete keep no counts. One row is cheap: of 500 frames of 512 x 512
-pixels it takes a fifth of a millisecond, 4 % of their time at 100 kHz, and only while somebody follows a row.
+Estimators that judge a column as soon as it is complete keep the counts of few rows only. To count one row more takes
+0.2 ms for 500 frames of 512 x 512 pixels, 4 % of the 5 ms that they last at 100 kHz. It is done only while somebody
+follows a row.
 """
 
 import logging

@@ -66,11 +66,14 @@ def compare_lines(
     orders: NDArray[np.int64],
     out: NDArray[np.float64],
 ) -> None:
-    """Compare the line of each point with its first two partners; writes to out (points, 3 + orders).
+    """Compare the line of each point with its first two partners: the next row of the same column, and the same row in
+    the nearest partner column. Writes to out (points, 3 + orders).
 
     lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
-    more, points). shift: (2 or more, points), pixels from a stripe of the line to the partner's. usual: (rows, width),
-    mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: replaces lower r in sqrt(K r).
+    more, points). shift: (2 or more, points), pixels from the stripe at the point to that at the partner. x0:
+    (columns,), first stored pixel; x_lo, x_hi: (rows, columns), first and last pixel of each search window. usual:
+    (rows, width), mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: replaces lower r
+    in sqrt(K r).
     orders: (orders, WORD_PX), pixels of each word.
 
     The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything

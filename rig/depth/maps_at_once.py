@@ -1,9 +1,9 @@
-"""Makes the maps of counted sweeps, several at once where the estimator can, and delivers them in the sweeps' order.
+"""Makes the maps of counted sweeps, several at once if the estimator allows it, and delivers them in the sweeps' order.
 
-A map made on one thread takes less time of all processors together than one that several threads share, since parts of
-it cannot be shared. So in a stream each thread makes a map of its own. The results are the same: an estimator says
-whether the next map's model is already fixed, although earlier maps are unfinished (`Reconstructor.may_begin`). If no
-other map can be made at the same time, all threads share it.
+A map made on one thread takes less processor time in total than one that several threads share, since parts of the work
+cannot be shared. So in a stream each thread makes a map of its own. The results are those that one map after the other
+would give: before a map is begun, the estimator says whether its model is fixed already although earlier maps are
+unfinished (`Reconstructor.may_begin`). If no other map can be made at the same time, all threads share the one map.
 """
 
 from collections import deque

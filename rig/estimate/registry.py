@@ -101,7 +101,8 @@ class ManyMaps(Protocol):
         ...
 
     def may_begin(self, frames: int) -> bool:
-        """Whether the state of the next map is certain while maps with so many lit frames are under way."""
+        """Whether there is a state for the next map that will not change while other maps are under way. frames: number
+        of frames that these maps have counted for columns, all together."""
         ...
 
     def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
@@ -200,7 +201,7 @@ class Recalled:
 
     @property
     def used(self) -> Learned | None:
-        """State with which the last map was estimated."""
+        """State with which the last map was estimated; None before the first map."""
         return self._of.used
 
     def counter(self, layout: "SweepLayout", geometry: "SweepGeometry") -> "Counter":

@@ -1,7 +1,8 @@
 """Writes a run as one HDF5 file. h5py opens it, and so does MATLAB with `h5read` or `load` (MAT-file of version 7.3).
 
     /frames/bits uint8 (frames, height, row bytes)  /frames/number run ticks time_s marks x0 y0 line sweep (1, frames)
-    /maps/depth_m float32 (maps, height, width)  /maps/number (1, maps)  /manifest UTF-16 (n, 1)
+    /maps/depth_m float32 (maps, height, width), if the rig is calibrated
+    /maps/number (1, maps)  /manifest UTF-16 (n, 1)
     /maps/x_px confidence x_sd_px signal haze, also x2_px confidence2 if the estimator has them (maps, rows, columns)
     /clock/tick_hz tick_hz_numerator tick_hz_denominator frame_period_ticks exposure_ticks (1, 1)
 

@@ -14,12 +14,13 @@ from rig.simd import Float32, Float64
 class StripeTable:
     """Result of an estimator for one sweep; all arrays float32 (rows, columns).
 
-    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN only where a column has no frames or a row
-    has no search window for it.
+    x_px: sub-pixel stripe position in raw pixels, centres at integers; NaN where there is no estimate.
+    The estimators of a scan give NaN only where a column has no frames or a row has no search window for it.
     confidence: probability that x_px is within 1 px of the truth, 0 to 1 (0 where x_px is NaN); that of `argmax` and
     `edge` takes no account of haze.
     x_sd_px: standard deviation of x_px given that it is the right stripe.
     signal: photons per exposure of the stripe, summed across it; haze: photons per exposure and pixel just before it.
+    x_sd_px, signal and haze are NaN where x_px is.
     x2_px: position of a second stripe in addition to x_px, nearer or farther (a pane before a wall), NaN where no light
     stands out. confidence2: probability that there is a stripe within 1 px of x2_px, 0 where x2_px is NaN. Both are
     None if an estimator does not look for a second stripe.

@@ -60,7 +60,8 @@ def compile_plan(
 
     point_clock: the scanner's exact clock for a requested rate (`BeamScanner.point_clock`).
     model: None if the rig is not calibrated; there is then no lag and the window is the whole row.
-    line_offsets: command offset of each laser line; the number of columns is a multiple of the number of lines.
+    line_offsets: command offset of each laser line. The number of columns must be a multiple of the number of lines;
+      the check of a config ensures it.
     Raises PlanError with one line per problem.
     """
 

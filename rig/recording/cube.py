@@ -240,7 +240,8 @@ def holds_bits(frames: NDArray[Any]) -> bool:
 
 
 def pack_line(frames: str, dtype: np.dtype[Any]) -> str:
-    """A line of numpy code that packs frames with one number per pixel."""
+    """Numpy code that packs frames, eight pixels a byte. frames: numpy code for an array with one number per pixel;
+    dtype: the type of that array. Numbers that are not integers or bool are first compared with 0."""
     return f"numpy.packbits({frames}, axis=2)" if dtype.kind in "biu" else f"numpy.packbits({frames} != 0, axis=2)"
 
 

@@ -170,8 +170,8 @@ class RunInfo:
     frames: number recorded. gaps: number of stretches missing between these and, if a repair found some, at the ends.
     lost: number of frames in the gaps. width, height: pixels of a frame. frame_rate_hz: None if triggered from outside.
     duration_s: from the first frame to the end of the last one or, without a rate, to the start of the last block.
-    first_frame_utc, utc_uncertainty_s: when the first frame was taken; None if the recording does not say (no
-    uncertainty: in a simulated rig's own time).
+    first_frame_utc: when the exposure of the first frame began, as text; None if the recording does not say.
+    utc_uncertainty_s: how far that time may be off; None if it is not known, or if a simulated rig ran in its own time.
     """
 
     run_id: int

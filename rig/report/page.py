@@ -108,7 +108,7 @@ def paragraph(text: str, *, small: bool = False) -> str:
 
 
 def preformatted(text: str) -> str:
-    """Plain text with its line breaks, such as a command or a config."""
+    """HTML that shows plain text with its line breaks, such as a command or a config. The text is escaped."""
     return f"<pre>{escape(text)}</pre>"
 
 

@@ -18,7 +18,8 @@ from rig.report.run_facts import RunFacts
 
 
 def calibration_section(runs: Sequence[RunFacts]) -> str:
-    """The calibration of each run: its age at the run, its verdict, and the depth error that it leaves."""
+    """HTML table with a column for each run, on its calibration: id and file, verdicts, age at the run, what it was
+    made from, and the depth error that it leaves. Rows of which no run says anything are left out."""
 
     def provenance(run: RunFacts) -> str:
         said = {**(value_at(run.manifest, "calibration.provenance") or {})}

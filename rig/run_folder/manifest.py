@@ -240,8 +240,8 @@ def inputs_problems(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
 
 
 def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Raise DamagedRecordingError, with one line each, for files beside the frames that differ from what the manifest
-    says.
+    """Raise DamagedRecordingError, with one line each, for files beside the frames that cannot be read or differ
+    from what the manifest says.
 
     Raises UsageError for an adaptive recording (`passes` in the manifest): each of its maps was put together from
     several partial sweeps.

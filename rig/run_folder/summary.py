@@ -107,7 +107,11 @@ Errors = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class TruthErrors:
-    """Errors against a known truth: means over the maps, but for medians the median over the maps."""
+    """Errors against a known truth by name, such as 'mean_abs', in pixels and metres; 'within_1px' and 'missing' are
+    shares.
+
+    Each error is the mean over the maps, but the median over the maps if its name begins with 'median'. None if no map
+    has a value."""
 
     stripe_error_px: Errors
     depth_error_m: Errors

@@ -41,10 +41,11 @@ MOST_SHARE_OF_MEMORY: Final = 0.5
 
 
 class RecordingSwitch:
-    """Switches the recording of a running scan. All methods may be called from any thread, before and during the scan.
+    """Switches the recording of a running scan on and off. Pass it to `rig.api.scan` as `switch`. `on` and `off` may be
+    called from any thread, before and during the scan; `take` is called by the recorder alone.
 
-    before: how far back a part begins, before it is switched on: seconds, or text such as '2 s'. Give the switch to
-    `rig.api.scan`. Raises UsageError for a time that is none or negative.
+    before: a part begins with the sweep that was under way this long before `on` was called: seconds, or text such as
+    '2 s'. Raises UsageError for text that is not a time, and for a time that is negative or not finite.
     """
 
     def __init__(self, before: str | float = 0.0) -> None:
@@ -76,7 +77,7 @@ class RecordingSwitch:
 
     @property
     def asked(self) -> bool:
-        """Whether a part is to begin, or goes on."""
+        """Whether a part is to begin or, if one is being recorded, is to go on after the sweep under way."""
         return self._pending or self._wanted
 
     def take(self) -> None:
@@ -195,7 +196,7 @@ class PartsRecording:
         return sum(recording.busy_s for recording in self._recordings)
 
     def holds(self, ring: BlockRing) -> int:
-        """Blocks of the ring that the recorder keeps at a time."""
+        """Number of blocks of the ring that `write_from` holds at a time; at least 1."""
         return max(1, min(self.keep_blocks + WRITERS, ring.slots - WRITERS))
 
     def begin(self, sweeps: int) -> None:

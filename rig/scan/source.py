@@ -18,11 +18,12 @@ HANG_S = 180.0
 
 
 class Source:
-    """The thread that fills the ring.
+    """The thread that fills the ring. It begins with `thread.start()`.
 
+    silence_s: each `fill` of the SPAD waits for frames for half of this time at most, in seconds (see `silences`).
     on_end: called on that thread when it ends, for whatever reason.
-    on_frame: called on that thread after each `fill` with the number of the last frame published or dropped; if it
-    raises, the source ends.
+    on_frame: called on that thread after each `fill` that brought frames, with the number of the last frame that was
+    published or dropped; if it raises, the source ends.
     times: notes when frames arrive.
 
     Its errors and the SPAD's are passed to the readers, after the blocks that came before.

@@ -107,10 +107,12 @@ def _drawings(folder: Path) -> list[str]:
 
 
 def panels_of(lines: Sequence[Line], labels: Sequence[str]) -> list[Panel]:
-    """A panel for each figure of interest, over the setting with the most numbers; a curve for the other settings.
+    """Panels that show figures over the setting with the most different numbers.
 
-    Points are means over seeds, with the range of the seeds as a bar.
-    """
+    labels: names of the columns that are settings. Each of the first MOST_PANELS figures that have two different
+    numbers or more gets a panel; those named in FIRST come first. A panel has a curve for each combination of the other
+    settings, MOST_CURVES at most. Points are means over seeds, and a bar shows the range of the seeds. The list is
+    empty if no setting has two different numbers."""
     over = max((key for key in labels if key != SEED), key=lambda key: len(_numbers(lines, key)), default=None)
     if over is None or len(_numbers(lines, over)) < 2:
         return []

@@ -90,7 +90,8 @@ class SceneEffects:
 
     planned_for: the largest values for which the choice of effects holds: power_w of all lines together, exposure_s of
       a column's frames together, and exposures, the number of these frames.
-    changed_decisions_bound: bound for all effects together that are left out.
+    changed_decisions_bound: largest share of an estimator's answers, 0 to 1, that all effects left out can
+      change together.
     """
 
     planned_for: Mapping[str, float]

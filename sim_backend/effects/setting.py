@@ -78,7 +78,7 @@ class BitEffect(Protocol):
         packbits order (`sim_backend.effects.sensor_bits.bit_of`). Pad bits stay 0.
 
         seed: of the run. before: (rows, words), the bits of frame first_frame - 1 as this effect received them, zeros
-        if that frame was not drawn. The result for a frame depends only on the seed, its number, its own bits and its
-        predecessor's, not on how frames are grouped in blocks. Releases the GIL.
-        """
+        if that frame was not drawn. times: exposure and period of the frames. The result for a frame depends only on
+        the seed, `times`, the frame's number, its own bits and its predecessor's, not on how frames are grouped in
+        blocks. Releases the GIL."""
         ...

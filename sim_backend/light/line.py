@@ -109,9 +109,8 @@ def line_width(view: CameraView, optics: Optics, sensor: Sensor, line: Line) -> 
 
 @numba.njit(cache=True, nogil=True)
 def sigma_px(width: Array, inverse_depth: float, range_m: float) -> float:
-    """Standard deviation in px of the line's profile along the row, at inverse depth 1/z (1/m) and range_m (m) from the
-    mirror.
-    """
+    """Standard deviation in px of the line's profile along the row. width: (4,) as `line_width` returns it.
+    inverse_depth: 1/z of the lit point, in 1/m. range_m: its distance from the mirror, in metres."""
     spread = width[1] * range_m * inverse_depth
     defocus = width[2] * (inverse_depth - width[3])
     return math.sqrt(width[0] + spread * spread + defocus * defocus)

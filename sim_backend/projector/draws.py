@@ -1,15 +1,17 @@
-"""Random counts of a one-bit SPAD and of a conventional camera.
+"""Random counts of a one-bit SPAD, and random readings of a conventional camera.
 
-A pixel that detects on average L photons in a frame reads 1 with probability 1 - exp(-L), so of n frames it fires in
+A SPAD pixel that detects on average L photons in a frame reads 1 with probability 1 - exp(-L), so of n frames it fires
+in
 
     N ~ Binomial(n, 1 - exp(-L)),    P(N = 0) = exp(-n L)
 
-These counts are drawn exactly. Most pixels may not fire at all, so they are skipped: n L is summed from pixel to pixel,
-and one exponential variate is the sum at which the next pixel fires. If few of its frames fire, or nearly all, its
-count is found by inversion (the chances of 1, 2, 3, ... one after the other), otherwise by rejection
-(`numpy.random.Generator.binomial`, BTPE). A flux of 0 never fires, an infinite one always. Draws go row by row, pattern
-by pattern and pixel by pixel, so they do not depend on how rows are grouped. Measured on one core: 2 ns for a pixel
-that does not fire, 40 ns for a few counts, 100 ns for many.
+These counts are drawn exactly. Most pixels never fire, and little time is spent on them: n L is added up from pixel to
+pixel, and the next pixel to fire is the one at which the sum reaches an exponential variate. If few of its frames fire,
+or nearly all, its count is found by inversion (the chances of 1, 2, 3, ... one after the other), otherwise by rejection
+(`numpy.random.Generator.binomial`, BTPE). With a flux of 0 a pixel never fires, with an infinite one always. Counts are
+drawn row by row, pattern by pattern and pixel by pixel, so one call for all rows gives the same counts as calls for
+groups of rows in ascending order. Readings of the camera are drawn array by array and depend on the grouping. Measured
+on one core: 2 ns for a pixel that does not fire, 40 ns for a few counts, 100 ns for many.
 """
 
 import math

@@ -1,7 +1,8 @@
 """Bodies and surfaces: where rays meet simple bodies, depth and albedo on the camera's pixel grid, procedural texture.
 
-Bodies are convex solids, upright cylinders and ellipsoids. The functions return the depth z at which a ray meets the
-body, inf if it misses. A ray is t (u, v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres. A
+Bodies are convex solids, upright cylinders and ellipsoids. Each has a function that returns the depth z at which a
+ray meets the body, and inf if the ray misses it. Bodies must lie wholly in front of the camera; around or behind it the
+depth may be negative. A ray is t (u, v, 1), so t is the depth z itself. Frame: x right, y down, z forward, metres. A
 2.5-D world consists only of depth and albedo by pixel. Texture is smooth noise from hashed lattice points, the same on
 every machine.
 """

@@ -123,7 +123,8 @@ class Joint:
         return MapSolver(RowWorkers(1))
 
     def may_begin(self, frames: int) -> bool:
-        """Whether the model of the next map is certain while maps with so many lit frames are under way."""
+        """Whether there is a model for the next map that will not change while other maps are under way. frames: number
+        of frames that these maps have counted for columns, all together."""
         return self._lessons.certain(frames)
 
     def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver) -> "MapWork":

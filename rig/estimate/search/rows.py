@@ -1,9 +1,12 @@
 """Estimate of image rows, compiled: a fast form of `rig.estimate.row.likelihood`, tested against it.
 
 Every position is scored, the best one examined closely, and what can be learned from the row is recorded. BATCH rows of
-one column go together through 16-bit scores (`rig.estimate.search.scores`, tables of `rig.estimate.search.tables`),
-with SCREENS amplitudes instead of all, one table for a band of up to 64 rows and counts of 6 bits. The input is
-`SearchTables`, the output `RowAnswers`, float32 (FIELDS, rows) per column; kernels get `SearchPointers` to both.
+one column are scored together, with 16-bit scores (`rig.estimate.search.scores`) and counts of 6 bits. The scores come
+from tables (`rig.estimate.search.tables`) for SCREENS amplitudes instead of all. A band of up to 64 rows shares a
+table.
+
+The input is `SearchTables`. The output is `RowAnswers`: `stripe` holds the answers, float32 (FIELDS, rows) per column,
+and the other arrays the sums and counts to learn from. Kernels get `SearchPointers` to both.
 
 `judge_rows` serves both frames as they come and counts of whole sweeps (`rig.estimate.search.stream`).
 """
@@ -423,7 +426,10 @@ def _learn_quiet(desk: SearchPointers, lanes: int, n: int, y: int, c: int, x: in
 
 @numba.njit(cache=True, nogil=True)
 def keep_line(n: int, lanes: int, window: int, to: int) -> None:
-    """Write the counts of a row in pixel order, int32, to `RowAnswers.lines`; n, to: addresses."""
+    """Write the counts of a row, int32 in pixel order, to a line of `RowAnswers.lines`.
+
+    n: address of the row's counts, bytes in lane order (`rig.count.lane_order`). lanes: of these counts. window: number
+    of pixels. to: address of the line."""
     for x in range(window):
         write_int32(to, x, np.int32(read_byte(n, place_of(x, lanes))))
 

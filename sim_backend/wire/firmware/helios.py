@@ -52,7 +52,10 @@ class Played:
 
 
 class DacHistory:
-    """Output over time: what was played, with rests in between during which the colours are low. Thread-safe."""
+    """Output over time: the pieces that were played, and rests between them during which the colour outputs are 0.
+
+    Pieces that ended more than `KEEP_S` before the newest piece begins are dropped, and the output at their times then
+    reads as a rest. Thread-safe."""
 
     def __init__(self, command: float, lines: int) -> None:
         self._lock = threading.Lock()
@@ -293,8 +296,10 @@ class HeliosModel(DacModel):
         self._replies.clear()
 
     def advance(self, now_s: float) -> None:
-        """Play on until now. A pending frame follows, with a longer first point; a single one ends with the colours
-        low.
+        """Play on until now. When a frame ends, the pending one follows, with a longer first point. If none is pending,
+        a frame with the flag SINGLE ends with the colours low, and any other frame is played again.
+
+        Frames are accepted again from 100 ms after STOP on.
         """
         if self._dead_until_s is not None and now_s >= self._dead_until_s:
             self._dead_until_s = None

@@ -106,7 +106,10 @@ class Spad512sModel:
         self._out.clear()
 
     def restarted(self) -> None:
-        """End the program and start it again."""
+        """Note that the program was started again: with a `calibration_s` above 0 the next `D` starts a calibration.
+
+        Nothing else changes: a run, a calibration under way and the excess bias stay as they were. A run ends when the
+        client is disconnected."""
         self._calibrated = self._program.calibration_s == 0
 
     def receive(self, data: bytes, now_s: float) -> None:
