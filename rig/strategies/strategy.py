@@ -65,7 +65,7 @@ class Strategy(Protocol):
 
     @property
     def source(self) -> str:
-        """Where the method is described: a publication (author, title, place, year) or a page of this program."""
+        """Description of the method: a publication (author, title, place, year) or a page of this program."""
         ...
 
     @property
