@@ -68,15 +68,17 @@ class MarkerInputs:
         lit = np.where(state.edge, int(Mark.GATE_EDGE), np.where(state.share > 0, int(Mark.GATE_HIGH), 0))
         marks = lit | np.where(state.backward, int(Mark.BACKWARD), 0)
         lines, sweeps = np.full(len(start_s), self.line), np.full(len(start_s), self.sweep)
-        events = [(float(t), 0, Mark.SCAN) for t in state.scan_s] + [(float(t), 1, Mark.LINE) for t in state.line_s]
+        # As plain numbers: Python keeps each combination of flags that it has once seen, for ever.
+        scan, line = int(Mark.SCAN), int(Mark.LINE)
+        events = [(float(t), 0, scan) for t in state.scan_s] + [(float(t), 1, line) for t in state.line_s]
         first = self.sweep
         for time_s, _, mark in sorted(events):
             frame = max(int(np.searchsorted(start_s, time_s, side="right")) - 1, 0)
-            if frame == 0 and mark is Mark.SCAN:
+            if frame == 0 and mark == scan:
                 first += 1
             place = min(int((time_s - float(start_s[frame])) / period_s * SUBFRAME_STEPS), SUBFRAME_STEPS - 1)
             marks[frame] = (int(marks[frame]) & ~(0xFF << SUBFRAME_SHIFT)) | mark | (max(place, 0) << SUBFRAME_SHIFT)
-            if mark is Mark.SCAN:
+            if mark == scan:
                 self.sweep, self.line = self.sweep + 1, 0
             else:
                 self.line += 1
