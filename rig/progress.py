@@ -22,7 +22,7 @@ class Step:
     """A report of progress.
 
     total: None if it is not known; otherwise `done` never exceeds it.
-    unit: of the counts, in the plural.
+    unit: the unit of `done` and `total`, in the plural.
     note: further text.
     part: the part of the command that the stage belongs to, such as 'pose 3 of 12'.
     """
@@ -49,7 +49,8 @@ def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = 
 
 
 def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
-    """A callback that reports its counts as progress of this stage, and passes them on to `progress`."""
+    """A callback that reports its counts as progress of this stage, and passes them on to `progress`. Both get at most the
+    total as what is done."""
 
     def count(done: int, total: int) -> None:
         tell_stage(stage, done, total, unit)
@@ -71,7 +72,8 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """A context in which all reports carry the name of this part. The first report is the stage PREPARING."""
+    """A context in which all reports of this thread carry the name of this part. It begins with a report of the stage
+    PREPARING."""
     token = _part.set(name)
     tell_stage(PREPARING)
     try:

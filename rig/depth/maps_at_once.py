@@ -18,7 +18,7 @@ from rig.shared_time import SharedTime
 
 
 class Counted(Protocol):
-    """A counted sweep. tally: of the maker's counter."""
+    """A counted sweep. tally: what the maker's counter gave for it."""
 
     @property
     def tally(self) -> FrameTally:

@@ -103,7 +103,10 @@ class DarkLook:
 
 
 def look(rig: OpenRig, plan: ScanPlan, stride: int) -> DarkLook:
-    """Run the scanner for a sweep with the gate low. Raises DeviceError. stride: bytes of the SPAD's largest block."""
+    """Run the scanner for a sweep with the gate low, then stop SPAD, scanner and sync source. Raises DeviceError.
+
+    stride: bytes of the SPAD's largest block.
+    """
     rig.scanner.load(plan.waveform, plan.scanner_repeats(1))
     rig.sync.program(DARK_PROGRAM, 1)
     if rig.guard is not None:  # frames may come late here: nothing can shine
@@ -151,7 +154,10 @@ class Finding:
 
 
 def examine(config: RigConfig, folder: Path) -> list[Finding]:
-    """Examine everything. folder: where a scan would write. Faults of config and devices are findings, not errors."""
+    """Open the devices and examine them, the calibration, the frames of a dark sweep and the disk. The mirror moves.
+
+    folder: where a scan would write. Faults of config and devices are findings, not errors.
+    """
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
@@ -333,8 +339,8 @@ def attached() -> list[Attached]:
 def laser_off(config: RigConfig) -> list[str]:
     """Set the gate low and switch emission off; returns what was done.
 
-    Both are tried even if one fails. Raises DevicesError with the failures, then with what was done. That a laser can
-    only be switched off by hand counts as a failure.
+    Both are tried even if one fails. Raises DevicesError, whose message names the failures first and then what was done. A
+    laser that can only be switched off by hand counts as a failure.
     """
     done: list[str] = []
     trouble: list[str] = []
