@@ -14,7 +14,8 @@ _at_end: ContextVar[ExitStack | None] = ContextVar("_at_end", default=None)
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """A context for work that an interrupt ends in order. The work calls `ignore_interrupts` once it has been interrupted.
+    """A context for work that an interrupt ends in order. The work calls `ignore_interrupts` once it has been
+    interrupted.
 
     From then until the outermost of nested contexts ends, further interrupts are ignored, so that results can still be
     written: the command `timeout` sends its signal twice, and impatient people press Ctrl-C again.
@@ -31,8 +32,8 @@ def one_interrupt() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Ignore Ctrl-C and the signals ENDING from now to the end of the outermost `one_interrupt`, or, if there is none, of the
-    program.
+    """Ignore Ctrl-C and the signals ENDING from now to the end of the outermost `one_interrupt`, or, if there is none,
+    of the program.
 
     Outside the main thread, which alone gets signals, nothing changes.
     """

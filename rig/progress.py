@@ -49,8 +49,8 @@ def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = 
 
 
 def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
-    """A callback that reports its counts as progress of this stage, and passes them on to `progress`. Both get at most the
-    total as what is done."""
+    """A callback that reports its counts as progress of this stage, and passes them on to `progress`. Both get at most
+    the total as what is done."""
 
     def count(done: int, total: int) -> None:
         tell_stage(stage, done, total, unit)

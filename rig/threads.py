@@ -175,7 +175,8 @@ class StageThread:
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` for the thread's end. Returns False if it still runs, True if it ended or was never started."""
+        """Wait at most `timeout_s` for the thread's end. Returns False if it still runs, True if it ended or was never
+        started."""
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()

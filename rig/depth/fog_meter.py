@@ -214,7 +214,8 @@ def read_fog(
 
     With a halo or several lines, only ambient light is given, and only if there are dark frames.
     sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: its stripe table, made with the `RowModel`
-    `state`. where: rows and columns of the lines of counts that are read from a `CountVolume`; None for `next_lattice`'s.
+    `state`. where: rows and columns of the lines of counts that are read from a `CountVolume`; None for
+    `next_lattice`'s.
     """
     from rig.depth.kernels import SUMS, add_clear_rows
     from rig.estimate.row.em import lines_of, next_lattice

@@ -121,10 +121,11 @@ def add_clear_rows(
 ) -> None:  # fmt: skip
     """Add the pixels that are clear_px or more before or behind the stripe at x_px, for each clear row of a column.
 
-    lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether the row's stripe is
-    beyond doubt; other rows are skipped. block: number of the block of rows and columns that the row belongs to. sums:
-    (blocks, 2, bins, SUMS), before and behind the stripe. at_stripe (lines, 2): path in metres and geometry factor of the
-    haze at the stripe, unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left out.
+    lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether the row's stripe
+    is beyond doubt; other rows are skipped. block: number of the block of rows and columns that the row belongs to.
+    sums: (blocks, 2, bins, SUMS), before and behind the stripe. at_stripe (lines, 2): path in metres and geometry
+    factor of the haze at the stripe, unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left
+    out.
     """
     row = row_buffers(sweep.window, state.amplitude.shape[0])
     step = 1 if sweep.near_is_left else -1

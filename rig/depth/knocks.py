@@ -39,8 +39,8 @@ KNOCKED: Final = (
 
 
 class KnockWatch:
-    """Compares the maps of a run, one after the other. geometry: that of the maps; None without a calibration, and nothing
-    is then compared."""
+    """Compares the maps of a run, one after the other. geometry: that of the maps; None without a calibration, and
+    nothing is then compared."""
 
     def __init__(self, geometry: SweepGeometry | None) -> None:
         self._geometry = geometry
@@ -55,8 +55,8 @@ class KnockWatch:
 
 
 def knocked(before: StripeTable, after: StripeTable, geometry: SweepGeometry) -> bool:
-    """Whether the stripes of the first or the last third of the columns have moved alike, near and far ones, since the map
-    before. False if too few are sure, or the scene is too flat to tell."""
+    """Whether the stripes of the first or the last third of the columns have moved alike, near and far ones, since the
+    map before. False if too few are sure, or the scene is too flat to tell."""
     columns = geometry.columns
     parts = slice(0, columns // 3), slice(columns - columns // 3, columns)
     return any(_moved_px(before, after, geometry, part) is not None for part in parts)

@@ -34,8 +34,8 @@ class MapResult:
     is no depth, which is everywhere without a calibration.
     compute_s: seconds that estimating and making the map took. learned: the state that the estimator used, None if it
     learns nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`) and
-    frames (`rig.count.sweep_watch`). floating: number of points left out because they float between two surfaces; None if
-    such points are kept, or without depth.
+    frames (`rig.count.sweep_watch`). floating: number of points left out because they float between two surfaces; None
+    if such points are kept, or without depth.
     """
 
     stripe: StripeTable
@@ -69,8 +69,8 @@ def map_geometry(
 
 
 class MapUnderWay(NamedTuple):
-    """A map that was begun. run: makes the map, on any thread. end: makes the estimator learn from it; called in the order of
-    the sweeps."""
+    """A map that was begun. run: makes the map, on any thread. end: makes the estimator learn from it; called in the
+    order of the sweeps."""
 
     run: Callable[[], MapResult]
     end: Callable[[], None]
@@ -98,10 +98,10 @@ class MakesMaps(Protocol):
 class Reconstructor:
     """Turns counted sweeps into maps; estimators that learn carry their state from map to map.
 
-    model, column_commands, lines: the same that were given to `map_geometry`. learned: states kept of earlier maps, one for
-    each map to come; each map is then estimated with its own state, and nothing is learned. kept: the state of an earlier
-    run, used by `joint` if it explains the first map. Raises KeyError for the estimator `auto` (`rig.scan.estimator`
-    chooses one first), and with `learned` for estimators that learn nothing.
+    model, column_commands, lines: the same that were given to `map_geometry`. learned: states kept of earlier maps, one
+    for each map to come; each map is then estimated with its own state, and nothing is learned. kept: the state of an
+    earlier run, used by `joint` if it explains the first map. Raises KeyError for the estimator `auto`
+    (`rig.scan.estimator` chooses one first), and with `learned` for estimators that learn nothing.
     """
 
     def __init__(
@@ -154,8 +154,8 @@ class Reconstructor:
     def map(self, sweep: FrameTally) -> MapResult:
         """Make the map of one counted sweep; its `compute_s` covers the estimate and all that follows it.
 
-        sweep: the result of a `counter`, or a `CountVolume`. Raises UsageError if an estimator of another package gives a
-        stripe table that is not valid.
+        sweep: the result of a `counter`, or a `CountVolume`. Raises UsageError if an estimator of another package gives
+        a stripe table that is not valid.
         """
         begun = time.perf_counter()
         try:

@@ -95,8 +95,8 @@ class CalibrationUse:
 def identity_of(rig: OpenRig) -> Identity:
     """Identity of an open rig, with the present date.
 
-    A rig that plays a recording has the identity and the date of the recorded rig; what `recorded_identity` raises is then
-    raised here too.
+    A rig that plays a recording has the identity and the date of the recorded rig; what `recorded_identity` raises is
+    then raised here too.
     """
     if isinstance(rig.spad, ReplaySpad):
         return recorded_identity(rig.spad.recording.path)

@@ -91,8 +91,8 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
     """A context with only the gate and the laser open, without a guard. A device that fails is None and adds a line to
-    `trouble`. If it fails by not answering, and its kind has bytes that switch it off, these are sent all the same: it may
-    still receive.
+    `trouble`. If it fails by not answering, and its kind has bytes that switch it off, these are sent all the same: it
+    may still receive.
 
     Raises DeviceError if the config has a simulated world and this cannot be made.
     """
@@ -123,8 +123,8 @@ def _told_off(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
 
 
 def check_files(config: RigConfig) -> None:
-    """Check every file that a config names, as `open_rig` would, but open no device. Raises UsageError with a line for each
-    problem."""
+    """Check every file that a config names, as `open_rig` would, but open no device. Raises UsageError with a line for
+    each problem."""
     problems: list[str] = []
     _load_model(config, problems)
     with ExitStack() as stack:

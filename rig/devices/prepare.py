@@ -104,8 +104,8 @@ def lead_s(rig: OpenRig) -> float:
 
 
 def spare_lead_s(rig: OpenRig) -> float:
-    """Further seconds before the first scan marker for which a burst gets room if its memory is large enough; 0 in virtual
-    time and for a SPAD without markers."""
+    """Further seconds before the first scan marker for which a burst gets room if its memory is large enough; 0 in
+    virtual time and for a SPAD without markers."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 

@@ -43,7 +43,8 @@ _JUDGED_SIGMAS: Final = 10.0
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open files as one sequence of frames. The form of each file is recognised unless the request states it.
 
-    Raises UsageError, a line per file, if it cannot be read, holds no whole number of frames, or could have both forms.
+    Raises UsageError with a line for each file that cannot be read, holds no whole number of frames, or could have both
+    forms.
     """
     form, rows = asked.form, asked.rows or ROWS
     opened = each_or_problems(files, lambda file: _open_pi_imaging(file, form, rows))
@@ -112,9 +113,8 @@ def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]
 
 
 def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError, a line per
-    file, if it cannot be read or holds no whole number of frames.
-    """
+    """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError with a line
+    for each file that cannot be read or holds no whole number of frames."""
     full = asked.form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
 

@@ -105,8 +105,8 @@ def _expected(errors: Sequence[DepthUncertainty]) -> str:
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
-    """Section with the expected depth error at one depth: its picture, and a table of its parts. A sentence if the scan does
-    not reach this depth."""
+    """Section with the expected depth error at one depth: its picture, and a table of its parts. A sentence if the scan
+    does not reach this depth."""
     if not np.isfinite(uncertainty.sd_m).any():
         return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
     rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]

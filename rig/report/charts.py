@@ -123,7 +123,8 @@ def chart_svg(
     notes: Sequence[str] = (),
     panel_px: tuple[int, int] = PANEL_PX,
 ) -> str:
-    """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, lines of small print, below.
+    """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, lines of small print,
+    below.
 
     panel_px: width and height that each panel takes up; the panel itself is always drawn in PANEL_PX.
     """

@@ -132,8 +132,8 @@ def _middle_column(run: RunFacts, row: int) -> int | None:
 def mean_profile(counted: RowCounts, stripe: Mapping[str, Float32], row: int, column: int) -> NDArray[np.float64]:
     """Mean counts per exposure (width,) of a column and its sure neighbours; NaN where none of them has counts.
 
-    Sure columns are those with a confidence of at least SURE. Each is shifted so that its stripe lies on that of `column`,
-    which must have a stripe.
+    Sure columns are those with a confidence of at least SURE. Each is shifted so that its stripe lies on that of
+    `column`, which must have a stripe.
     """
     counts, x_px = counted.counts, stripe["x_px"][row]
     columns, width = counts.shape

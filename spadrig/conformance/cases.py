@@ -65,7 +65,10 @@ class Taken:
 
 
 def run(case: SpadCase, timing: SpadTiming, n_frames: int) -> tuple[BlockRing, list[FrameBlock]]:
-    """One run to its end, in a ring that takes it all, however short the device makes its blocks after a loss."""
+    """Run a SPAD array to its end; returns the ring and the blocks in it.
+
+    The ring has room for all of them, however short the device makes its blocks after a loss.
+    """
     ring = BlockRing(2 * n_frames // case.request.block_frames + n_frames // 8, timing.stride)
     reader = ring.reader("test")
     case.device.start(n_frames)
@@ -84,8 +87,8 @@ def take(case: SpadCase) -> Taken:
 
 @dataclass(frozen=True)
 class ScannerCase:
-    """A scanner, open. `turning` tells whether the mirror really moves, also after the device was closed. `let_pass`
-    lets so many seconds pass for it."""
+    """A scanner, open. `turning` tells whether the mirror really moves, even after the device was closed. `let_pass`
+    lets a number of seconds pass for it."""
 
     device: BeamScanner
     turning: Callable[[], bool]
@@ -94,7 +97,7 @@ class ScannerCase:
 
 @dataclass(frozen=True)
 class LaserCase:
-    """A laser, open and off. `shining` tells whether it would shine through an open gate, also after close."""
+    """A laser, open and off. `shining` tells whether it would shine through an open gate, even after close."""
 
     device: LineLaser
     clock: Clock
@@ -105,7 +108,7 @@ class LaserCase:
 class SyncCase:
     """A sync source that is open.
 
-    trigger: sends one scan marker to its input. pins: reads its outputs, also after it is closed. waiting: state in its
+    trigger: sends one scan marker to its input. pins: reads its outputs, even after it is closed. waiting: state in its
     status while a program waits. plays: whether its outputs follow the program; those of a stand-in always stay low.
     step_s: time of a step of the program, much longer than the delays of the wire, so that the suite can see each step.
     """

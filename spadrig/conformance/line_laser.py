@@ -23,7 +23,10 @@ def arm(case: LaserCase) -> None:
 
 
 def check_dark(case: LaserCase, *, armed: bool) -> None:
-    """Assert that it is dark; of one that only its gate ends, that nobody can take it for dark."""
+    """Assert that the laser is dark. If only a gate ends its light, assert that it shines and says so.
+
+    armed: what its status must say.
+    """
     status = case.device.status
     assert (status.emission, status.armed) == (case.device.gate_only, armed)
     assert case.shining() == case.device.gate_only
