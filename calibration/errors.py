@@ -1,5 +1,5 @@
-"""The errors of this package, and what stands in messages: numbers of few digits and, but for condition numbers,
-without powers of ten; text that a terminal can show."""
+"""The errors of this package, and text for messages: numbers with few digits and, except for condition numbers, without
+powers of ten; text that a terminal can show."""
 
 import numpy as np
 
@@ -36,7 +36,8 @@ class FileError(CalibrationError):
 
 
 def digits(value: float, count: int = 3) -> str:
-    """A number rounded to `count` significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for NaN."""
+    """A number rounded to `count` significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for NaN, 'inf'
+    for infinity."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else f"{value:g}"
     value = value + 0.0  # -0 is 0

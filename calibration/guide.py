@@ -113,7 +113,10 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
 
 
 def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
-    """The best of the given poses (at least one) by the forecast, as the next pose; the first one if all are NaN."""
+    """The best of the given poses (at least one) by the forecast, as the next pose; the first one if all are NaN.
+
+    now_m: the expected depth error at `at_m` without another pose.
+    """
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))

@@ -28,7 +28,8 @@ class SharedTime:
 
     @contextmanager
     def charge(self) -> Iterator[ChargedTime]:
-        """A context whose work is charged. The `ChargedTime` that it gives holds the time after the context has ended."""
+        """A context whose work is charged. It gives a `ChargedTime`, which holds the time after the context has
+        ended."""
         spent = ChargedTime()
         begun_s = self._step(1)
         try:

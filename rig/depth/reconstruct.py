@@ -174,7 +174,8 @@ class Reconstructor:
         return [Lane(self.estimator.solver(), RowWorkers(1)) for _ in range(n)] if n > 1 else []
 
     def may_begin(self, frames: int) -> bool:
-        """Whether the next map may be begun while maps with `frames` lit frames in total are under way. Needs `lanes`."""
+        """Whether the next map may be begun while maps with `frames` lit frames in total are under way. Only with
+        `lanes`."""
         assert isinstance(self.estimator, ManyMaps), "it has lanes"
         return self.estimator.may_begin(frames)
 

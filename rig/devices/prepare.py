@@ -99,7 +99,8 @@ They are added if the memory has room and the SPAD has markers: reading then end
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Seconds between the SPAD's start and the first scan marker. A burst must have room for the frames of this time."""
+    """Seconds between the SPAD's start and the first scan marker; a burst must have room for the frames of this
+    time."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 
