@@ -68,7 +68,8 @@ class ValueSources:
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
     def flag(self, key: Key) -> str | None:
-        """The option by which the value of a key was given, if that has a name of its own; else None."""
+        """The name of the option by which the value of a key was given; None if it was given otherwise or the option
+        has no name."""
         return f"`{self.flags[key]}`" if self._is_option(key) and key in self.flags else None
 
     def place(self, key: Key) -> str:

@@ -68,9 +68,9 @@ class Lag(NamedTuple):
 class Identity:
     """The rig, date and verdict of a calibration. Programs check them before they use the model.
 
-    rig: hash of the relevant part of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
-    serials: of the devices by slot (spad, scanner, ...), if known. verdict, reasons: of the calibration and of its last
-    check; None and () if there was none.
+    rig: hash of kinds and serials. name: the rig's name. created: date and time, ISO 8601. kinds, serials: those of the
+    devices by slot (spad, scanner, ...), if known. verdict: that on the calibration when it was made, None if it was
+    not judged. reasons: codes of the reasons against it.
     """
 
     rig: str

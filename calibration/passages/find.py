@@ -163,9 +163,9 @@ GROUPS = 4
 class SweepCounts:
     """The counts of a sweep.
 
-    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
-    command: (columns,), their mean mirror command, not corrected for lags; NaN for columns without frames. x0:
-    (columns,), first pixel of each column's window. width: of the picture, in pixels.
+    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), number of
+    frames. command: (columns,), mean mirror command of these frames, not corrected for lags; NaN for columns without
+    frames. x0: (columns,), first pixel of each column's window. width: width of the picture in pixels.
     """
 
     counts: Counts
@@ -411,8 +411,8 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """True on the squares of a board whose corners were found (4 at least), and on the paper around. size: (height,
-    width) of the result."""
+    """True on the squares of a board whose corners were found (4 at least), and on the paper around; all False if no
+    homography fits the corners. size: (height, width) of the result."""
     at_m = board.corners_m[corners.ids][:, :2]
     homography, _ = cv2.findHomography(at_m, corners.px, method=0)
     mask = np.zeros(size, np.uint8)

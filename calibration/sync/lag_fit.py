@@ -164,7 +164,8 @@ def clusters(seen: SharedPixels) -> NDArray[np.int64]:
 
 
 def clustered(values: Array, cluster: NDArray[np.int64]) -> Array:
-    """Sums (clusters, n) of values (pixels, sweeps, n)."""
+    """Sums (clusters, n) of values (pixels, sweeps, n) over each cluster. cluster: (pixels, sweeps), as from
+    `clusters`."""
     at = cluster.reshape(-1)
     return np.stack([np.bincount(at, values[:, :, a].reshape(-1)) for a in range(values.shape[2])], axis=1)
 

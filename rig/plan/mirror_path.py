@@ -216,7 +216,7 @@ class PathDemand:
 
     @property
     def cruise_margin_s(self) -> float:
-        """Seconds at constant velocity on either side of the lit part; the lag is then steady while the gate is open."""
+        """Seconds at constant velocity on either side of the lit part; the lag is steady while the gate is open."""
         return self.lag_s + self.gate_margin_s + self.lead_s
 
 
