@@ -255,8 +255,7 @@ def judge_sync(
     fit: SyncFit, model: RigModel | None, asked: AccuracyGoal | None, changed: Reason | None = None
 ) -> Verdict:
     """Judge a fit of lags. model, asked: None if the lag's effect on depth is unknown. changed: why the model is wrong
-    with these lags, or None.
-    """
+    with these lags, or None. Raises CalibrationError if the line does not reach `asked.at_m`."""
     found = []
     if not fit.steady:
         text = (

@@ -211,7 +211,7 @@ class RigFit:
 
     @property
     def corner_rms_px(self) -> float:
-        """Root mean square of all corners' distances."""
+        """Root mean square distance, in pixels, of all corners from where the fit puts them."""
         return rms(np.concatenate(self.corner_residual_px))
 
 

@@ -92,7 +92,7 @@ def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> li
 
 
 def normals(rows: Sequence[tuple[Rows, Rows]], weight: Sequence[Weights], jitter: float) -> list[ViewNormal]:
-    """The normal equations of each view. jitter: variance."""
+    """The normal equations of each view. jitter: variance of the mirror's jitter, in squared command units."""
     return [view_normal(*pair, of_view, jitter) for pair, of_view in zip(rows, weight, strict=True)]
 
 
