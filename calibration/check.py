@@ -143,10 +143,10 @@ _PARALLEL = 1e-6
 class CheckedBoard:
     """The result of the scan of one board; lengths in metres.
 
-    distance_m: its mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
-    expected_m: the rms expected from covariance and noise. chi2, freedom: of the deviations. scale: scanned size over
-    stated size; scale_sd: its expected sd. point_rms_m: rms deviation of single passages from the plane. cells_m:
-    (squares down, across) deviations, NaN where a square was not scanned.
+    distance_m: the board's mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their
+    plane; expected_m: the rms expected from covariance and noise. chi2, freedom: chi squared of the deviations and its
+    degrees of freedom. scale: scanned size over stated size; scale_sd: its expected sd. point_rms_m: rms deviation of
+    single passages from the plane. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
     """
 
     name: str

@@ -11,7 +11,8 @@ def plain_text(text: str) -> str:
 
 
 class CalibrationError(ValueError):
-    """Raised for input that cannot be used. One line says what is wrong and, mostly, value, limit and next step."""
+    """Raised for input that cannot be used. Its text is one line: what is wrong and, if possible, value, limit and next
+    step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
@@ -45,7 +46,8 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def condition_text(condition: float) -> str:
-    """The text of a condition number with two digits and a power of ten, as '3.1e+07'; 'inf' if it is not finite."""
+    """The text of a condition number with two digits and a power of ten, such as '3.1e+07'; 'inf' if it is not
+    finite."""
     return f"{condition:.1e}" if np.isfinite(condition) else "inf"
 
 

@@ -42,7 +42,7 @@ _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = "", note: str = "") -> None:
-    """Report the present stage of this thread's work."""
+    """Report the present stage of this thread's work to its listener; does nothing without one."""
     listener = _listener.get()
     if listener is not None:
         listener(Step(stage, done if total is None else min(done, total), total, unit, note, _part.get()))

@@ -62,9 +62,8 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """Evidence from the poses: largest angle between two boards, median distance, median angle that a board's longer
-    side fills; NaN without poses.
-    """
+    """Evidence from the poses; NaN without poses. tilt_rad: largest angle between two boards. distance_m: median
+    distance. board_rad: median angle that a board's longer side fills."""
 
     tilt_rad: float
     distance_m: float
@@ -277,7 +276,7 @@ class FitEvidence:
     noise. shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise;
     moved_after: the view after which the rig moved, if one move explains the shifts. misfit: factor by which the
     variances were increased because the data contradict each other. baseline_m, baseline_sd_m: distance from camera to
-    mirror axis, and its sd. velocities_per_s: of the sweeps, signed; empty if unknown.
+    mirror axis, and its sd. velocities_per_s: signed velocities of the sweeps; empty if unknown.
     """
 
     poses: PoseEvidence

@@ -150,9 +150,8 @@ SPEED_MARGIN: Final = 0.05
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
-    """The lags that sweeps determine, in groups with one value each. Both are in one group if they cannot be separated;
-    there is no group if neither can be determined.
-    """
+    """The names of the lags that sweeps determine, in groups with one value each. Both are in one group if they cannot
+    be separated; there is no group if neither can be determined."""
     velocity = np.asarray(velocities_per_s, np.float64)
     up, down = velocity[velocity > 0], -velocity[velocity < 0]
     several = _several(up) or _several(down)

@@ -67,9 +67,9 @@ class ColumnSums:
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """For each column, the share of 1s (columns, pixels) over the columns from `begin` to before `end` relative to
-        it, NaN without frames; and the number of frames, (columns, pixels or 1).
-        """
+        """The share of 1s (columns, pixels) in a range of columns around each column, NaN without frames; and the
+        number of frames in the range, (columns, pixels or 1). begin, end: the first column of the range and the one
+        after its last, relative to the column."""
         edges = np.arange(self.columns)
         first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
         frames = (self.frames[last] - self.frames[first]).astype(np.float32)
@@ -118,7 +118,7 @@ def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
     The order goes from coarse to fine: pixels whose row and column are multiples of 4 come before the other pixels
-    whose row and column are even. It follows from the bits of y xor x and of y in turn, the lowest bit first.
+    whose row and column are even. The order follows from the bits of y xor x and of y in turn, the lowest bit first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())
@@ -221,8 +221,7 @@ def find_passages(
     most: int = MOST_PASSAGES,
 ) -> Passages:
     """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; none if the line is not
-    visible. direction, speed_per_s: of the sweep, as in `Passages`.
-    """
+    visible. direction, speed_per_s: those of the sweep, as in `Passages`."""
     rows = sweep.counts.shape[1]
     pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
     kept: list[tuple[NDArray[np.int64], Array, Array]] = [(pixels[:0], np.empty(0), np.empty(0))]

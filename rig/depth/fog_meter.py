@@ -64,10 +64,11 @@ class FogFit:
 
 
 def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
-    """Fit of block sums (blocks, 2, bins, 4), or None if too little was seen before stripes. path_m: (bins,).
+    """Fit block sums (blocks, 2, bins, 4); None if too little was seen before stripes. path_m: (bins,), the path of
+    each.
 
-    Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
-    parameter's error is widened to the sandwich's if that is larger.
+    Newton's steps, damped as by Levenberg, start from the likeliest of several extinctions. The covariance is that of
+    the counts; each parameter's error is widened to the sandwich's if that is larger.
     """
     blocks, _, bins, _ = sums.shape
     used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES

@@ -72,9 +72,10 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of pixels that fired, in the first frame of each block.
-    n_bytes: bytes of all frames' pixels. seconds: from the start of the mirror until all frames had come. counters: the
-    SPAD's own, read before it was stopped. triggered: whether the sync source's program ran to its end.
+    records: (n,), one for each frame. dark_share: share of pixels that fired, in the first frame of each block.
+    n_bytes: bytes of all frames' pixels. seconds: time from the start of the mirror until all frames had come.
+    counters: those of the SPAD, read before it was stopped. triggered: whether the sync source's program ran to its
+    end.
     """
 
     records: NDArray[np.void]

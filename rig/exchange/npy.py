@@ -196,7 +196,7 @@ class MapFiles:
 
 
 def load(file: Path, read: Callable[[Path], Any]) -> Any:
-    """Load a file of numpy's. Raises UsageError, with one line, if that fails."""
+    """What `read` gives for a numpy file. Raises UsageError, with one line, if it cannot be read."""
     try:
         return read(file)
     except (OSError, ValueError) as error:

@@ -83,8 +83,8 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if this OpenCV writes no films or
-    only a part of the film was written."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Without pictures no file is written. Raises
+    UsageError if this OpenCV writes no films or only a part of the film was written."""
     import cv2
 
     film = None

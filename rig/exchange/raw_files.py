@@ -2,7 +2,8 @@
 
 SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
 significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
-Sparse lists are u32 little-endian numbers of the pixels that fired, counted row by row; rows x 512 ends a frame.
+Sparse lists are u32 little-endian numbers of the pixels that fired, counted row by row; the number rows x 512 ends a
+frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper

@@ -31,7 +31,8 @@ N_FRAMES = 500
 
 
 def require_final(device: Device, *verbs: Callable[[], object]) -> None:
-    """Leave the device's block by an error; assert that this closed it for good: no verb is possible any more."""
+    """Leave the device's `with` block by an error; assert that this closed the device for good: every verb raises
+    WrongState."""
     with pytest.raises(RuntimeError, match="on the way"), device as entered:  # noqa: PT012
         assert entered is device
         raise RuntimeError("on the way")
@@ -55,7 +56,7 @@ class SpadCase:
 
 @dataclass(frozen=True)
 class Taken:
-    """A run of a SPAD array that is over: its blocks, all still in the ring, and the counters behind it."""
+    """A run of a SPAD array that is over: its blocks, all still in the ring, and the counters after it."""
 
     case: SpadCase
     timing: SpadTiming

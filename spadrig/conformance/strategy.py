@@ -39,7 +39,7 @@ SURE, MOST_WRONG = 0.9, 0.01
 
 @cache
 def world(folder: str, lux: float) -> Any:
-    """The world with the suite's rig and wall, in ambient light of `lux`. folder: for its files."""
+    """The world with the suite's rig and wall, in ambient light of `lux`. folder: where its files are written."""
     geometry = Path(folder) / "rig.yaml"
     geometry.write_text(yaml.safe_dump(_calibration()), encoding="utf-8")
     surfaces = Path(folder) / "wall"
@@ -81,9 +81,9 @@ def _calibration() -> dict[str, Any]:
 
 
 class StrategyBench:
-    """Makes apparatus for the suite, and knows the truth. folder: for files.
+    """Makes apparatus for the suite, and knows the truth. folder: where files are written.
 
-    geometry: of the rig. scored: (rows, width), pixels that the source lights and the camera sees.
+    geometry: that of the rig. scored: (rows, width), pixels that the source lights and the camera sees.
     """
 
     def __init__(self, folder: Path) -> None:
