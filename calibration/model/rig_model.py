@@ -87,15 +87,15 @@ class RigModel:
     """Camera, scanner, lag, defects and provenance of one rig.
 
     speed_range_per_s: lowest and highest command speed for which the lag holds; None if the lag was not measured.
-    source_m: (3,) where the light leaves the mirror, metres, camera frame; None if unknown. defects: (height, width)
-    bool, True = pixel not to be used; None if unknown.
-    dark_rate_per_s: (height, width) float32, counts per second in the dark; None if unknown. row_delay_s: delay of each
-    row's exposure after that of the row above. gate_delay_s: delay of the light after the gate's edge. colour_skew_s:
-    time by which the scanner's gate output precedes its mirror. marker_rising: whether the rising edge of a scan marker
-    counts, rather than the falling one.
-    covariance: that of the estimated parameters, None if unknown. identity: None if it was not recorded. Raises
-    CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and planes
-    within 45 degrees of the image row, since they give no position along the row.
+    source_m: (3,) where the light leaves the mirror, metres, camera frame; None if unknown.
+    defects: (height, width) bool, True = pixel not to be used; None if unknown.
+    dark_rate_per_s: (height, width) float32, counts per second in the dark; None if unknown.
+    row_delay_s: delay of each row's exposure after that of the row above. gate_delay_s: delay of the light after the
+    gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
+    rising edge of a scan marker counts, rather than the falling one.
+    covariance: that of the estimated parameters, None if unknown. identity: None if it was not recorded.
+    Raises CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and
+    planes within 45 degrees of the image row, since they give no position along the row.
     """
 
     camera: Camera

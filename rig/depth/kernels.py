@@ -10,11 +10,12 @@ from one pixel to the next. So with the standard deviations of both stripes
 
     sd of inverse depth = s ((1 - f) sd_a + f sd_b)
 
-if the errors of neighbouring stripes are the same. With the estimator `joint` they nearly are, so the stated error of
-the depth is right if that of the stripes is. If the errors are independent of each other, the standard deviation is
+if the errors of neighbouring stripes are equal. With the estimator `joint` they nearly are, so the stated error of the
+depth is right if that of the stripes is. If the errors are independent of each other, the standard deviation is
 smaller, down to 0.7 times this.
-`depth_rows` turns inverse depth w into depth 1 / w, whose standard deviation is that of w over w^2. `add_clear_rows`
-adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the stripes of a sweep.
+`depth_rows` turns inverse depth w into depth 1 / w, whose standard deviation is that of w over w^2.
+`add_clear_rows` adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the
+stripes of a sweep.
 """
 
 from typing import Final

@@ -341,7 +341,7 @@ def laser_off(config: RigConfig) -> list[str]:
     """Set the gate low and switch emission off; returns what was done.
 
     Both are tried even if one fails. Raises DevicesError, whose message names the failures first and then what was
-    done. A laser that can only be switched off by hand counts as a failure.
+    done. A laser that can only be switched off by hand counts as a failure. Also raises what `open_light` raises.
     """
     done: list[str] = []
     trouble: list[str] = []

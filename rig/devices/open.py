@@ -76,11 +76,11 @@ class EmulatesDevices(Protocol):
 def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> Iterator[OpenRig]:
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
-    A simulated rig has virtual time; a real one, or a simulated one that works in real time, has the host's. seed: seed
-    of everything simulated.
-    tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic. Raises
-    UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems. Raises
-    DeviceError for a laser or gate that must be guarded, where no guard can run.
+    A simulated rig has virtual time; a real one, or a simulated one that works in real time, has the host's.
+    seed: the seed of everything simulated.
+    tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic.
+    Raises UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems.
+    Raises DeviceError for a laser or gate that must be guarded, where no guard can run.
     """
     if any(getattr(config, slot).real_time for slot in GUARDED):
         require_linux()  # before anything is opened

@@ -196,7 +196,7 @@ class MapFiles:
 
 
 def load(file: Path, read: Callable[[Path], Any]) -> Any:
-    """What `read` gives for a numpy file. Raises UsageError, with one line, if it cannot be read."""
+    """Read a numpy file with `read`. Raises UsageError, with one line, if that fails."""
     try:
         return read(file)
     except (OSError, ValueError) as error:

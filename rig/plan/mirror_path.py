@@ -210,7 +210,8 @@ class PathDemand:
 
     @property
     def gate_margin_s(self) -> float:
-        """Seconds for which the gate is open beyond each end of the lit part: `guard_s` plus its clock's drift."""
+        """Seconds that the gate is open beyond each end of the lit part: `guard_s` and the drift of the gate's
+        clock."""
         # The drift counts from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
 
