@@ -265,8 +265,9 @@ class CameraFit:
     """A camera and the data it was fitted to. Sequences run over the views with enough corners, which `views` names.
 
     residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
-    distance of those. outliers: names of the views with more than one corner left out, mirrored ones too. condition:
-    condition number of the normal equations at unit diagonal. spread_rad: largest angle between the boards in the fit.
+    distance of the corners in the fit. outliers: names of the views with more than one corner left out, mirrored ones
+    too. condition: condition number of the normal equations at unit diagonal. spread_rad: largest angle between the
+    boards in the fit.
     """
 
     camera: Camera

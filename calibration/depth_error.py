@@ -31,7 +31,8 @@ _STEP = 1e-6
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
-    """measure(model) (n,) and its covariance (n, n) to first order, which is zero for a model without a covariance."""
+    """The values of measure(model), (n,), and their covariance (n, n) to first order, zero for a model without
+    covariance."""
     values = np.atleast_1d(measure(model)).astype(np.float64)
     if model.covariance is None:
         return values, np.zeros((values.size, values.size))

@@ -50,8 +50,8 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with the line of each key, and the keys given as options, with the options'
-    names."""
+    """The origin of values. file: name of a file, for messages. lines_of: gives the line of each key in it. options:
+    keys whose values were given as options. flags: the options' names, by key."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict

@@ -140,7 +140,8 @@ class RigModel:
         return np.asarray(getattr(self.scanner, "command", np.linspace(*self.scanner.command_range, 33)))
 
     def planes(self, commands: ArrayLike) -> Array:
-        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...). Raises as `Scanner.planes`."""
+        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...). Raises CalibrationError outside the
+        command range."""
         return self.scanner.planes(commands)
 
     def sheets(self, commands: ArrayLike) -> LightSheets:

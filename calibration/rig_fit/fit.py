@@ -60,7 +60,8 @@ class Rounds:
         self.free = list(self.base)
 
     def run(self) -> None:
-        """Fit and decide until nothing changes or rounds are over. Raises Degenerate or LinAlgError, as `solved`."""
+        """Fit and decide until nothing changes, or for MOST_ROUNDS. Raises Degenerate or LinAlgError as `solved` does,
+        and Degenerate for a lag clearly below 0."""
         idle = 0
         for _ in range(MOST_ROUNDS):
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)

@@ -320,7 +320,8 @@ def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[st
 
 
 def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """The outcome of the comparison for a manifest: the word `checked`, or 'accepted' and the reasons, if any."""
+    """The outcome of the comparison for a manifest: 'accepted' with the accepted reasons, or the word `checked` without
+    any."""
     if not accepted:
         return {"check": checked}
     return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}

@@ -308,7 +308,8 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 class Attached:
     """One attached device.
 
-    address: the value of a config's `port` for it. kind: kind of its driver; None for a serial port of any kind.
+    address: the value of a config's `port` for it. what: description for people. kind: kind of its driver; None for a
+    serial port of any kind.
     """
 
     address: str

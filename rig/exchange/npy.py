@@ -64,7 +64,8 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Arrays (frames,): number, run id, ticks and time_s of the SPAD's clock, and other fields of the records."""
+        """Arrays (frames,) by name: number, run (its id), ticks and time_s of the SPAD's clock, and marks, x0, y0, line
+        and sweep of the records."""
         runs, *arrays = zip(*self._parts, strict=True)
         number, ticks, records = map(np.concatenate, arrays)
         return {

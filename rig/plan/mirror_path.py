@@ -334,7 +334,8 @@ def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_cloc
 
 
 def narrowed(edges: tuple[float, float], share: float, limits: tuple[float, float]) -> tuple[float, float]:
-    """A share of the range of `edges` about its middle, moved inside the scanner's range if necessary."""
+    """The edges of a share of the range between `edges`, about its middle. They are moved into the scanner's range,
+    `limits`, if necessary."""
     half = (edges[1] - edges[0]) / 2 * share
     low, high = limits
     middle = min(max((edges[0] + edges[1]) / 2, low + abs(half)), max(high - abs(half), low + abs(half)))

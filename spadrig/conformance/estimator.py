@@ -61,7 +61,8 @@ def flux(geometry: SweepGeometry) -> NDArray[np.float64]:
 
 
 def sweep_of(counts: NDArray[np.unsignedinteger], geometry: SweepGeometry, exposures: int) -> CountVolume:
-    """A counted sweep of whole rows (columns, rows, width), in the geometry's windows. Column 3 has no frames."""
+    """A counted sweep from counts of whole rows (columns, rows, width), cut to the geometry's windows. Column 3 has no
+    frames."""
     used = np.zeros((COLUMNS, ROWS, geometry.window), counts.dtype)
     for column, first in enumerate(geometry.x0):
         part = counts[column, :, first : first + geometry.window]
@@ -100,7 +101,8 @@ def require_promises(table: StripeTable, sweep: CountVolume, geometry: SweepGeom
 
 
 class EstimatorSuite:
-    """Tests of an estimator. The fixture `create_estimator` gives a function from threads to a fresh estimator."""
+    """Tests of an estimator. The fixture `create_estimator` gives a function that takes a number of threads and returns
+    a fresh estimator."""
 
     @pytest.fixture
     def geometry(self) -> SweepGeometry:
