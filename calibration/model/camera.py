@@ -298,7 +298,7 @@ class Camera:
         return du / fx, dv / fx
 
     def project(self, points_m: ArrayLike) -> tuple[Array, Array]:
-        """Raw pixel (x_px, y_px) of points (..., 3) in metres, also outside the picture; NaN behind the camera and
+        """Raw pixel (x_px, y_px) of points (..., 3) in metres, even outside the picture; NaN behind the camera and
         beyond the lens model's fold."""
         points = np.asarray(points_m, np.float64)
         with np.errstate(all="ignore"):

@@ -12,8 +12,8 @@ _LOOK_S = 0.5
 
 
 def arm(case: LaserCase) -> None:
-    """Arm at half of the power range and wait for emission, which may follow after a warm-up or a safety delay. Fails
-    after WARM_UP_S."""
+    """Arm in the middle of the power range and wait for emission, which may follow after a warm-up or a safety delay.
+    Fails after WARM_UP_S."""
     limits = case.device.limits
     case.device.arm((limits.min_power_w + limits.max_power_w) / 2)
     for _ in range(int(WARM_UP_S / _LOOK_S)):

@@ -105,8 +105,8 @@ class StrategyBench:
         return made
 
     def measured(self, strategy: Strategy, apparatus: Apparatus, time_s: float, seed: int) -> Answer:
-        """The answer of a strategy. Asserts that its form is that of `Answer` and that its depths are positive and
-        finite."""
+        """The answer of a strategy. Asserts that its form is that of `Answer` and that its depths are positive, or NaN
+        where there is no answer."""
         answer = strategy.measure(apparatus, self.geometry, Budget(time_s), seed)
         require_form(answer, strategy.name, (ROWS, WIDTH))
         given = np.isfinite(answer.depth_m)
