@@ -202,7 +202,8 @@ class Reconstructor:
         self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float, used: Learned | None,
         workers: RowWorkers,
     ) -> MapResult:  # fmt: skip
-        """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread."""
+        """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread. Raises
+        UsageError as `map` does."""
         begun = time.perf_counter() - estimate_s
         geometry = self._bound(sweep)
         if self._name not in ESTIMATORS and (problem := stripe.problem(geometry.rows, geometry.columns)):

@@ -126,7 +126,7 @@ def chart_svg(
     """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, lines of small print,
     below.
 
-    panel_px: width and height that each panel takes up; the panel itself is always drawn in PANEL_PX.
+    panel_px: width and height of the place for each panel; a `Panel` itself is always drawn in PANEL_PX.
     """
     across = min(across, len(panels))
     down = -(-len(panels) // across)
