@@ -10,7 +10,7 @@ Mask = NDArray[np.bool_]
 
 
 def set_frozen(owner: object, **values: Any) -> None:
-    """Set fields of a frozen dataclass during its creation. Arrays become read-only."""
+    """Set fields of a frozen dataclass during its creation. Arrays are not copied and become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False

@@ -50,9 +50,8 @@ class Normal:
         return float(eigen[-1] / eigen[0]) if eigen[0] > 0 else float("inf")
 
     def covariance(self, variance_px2: float) -> Covariance:
-        """The covariance if corners have this variance. Raises CalibrationError or LinAlgError if the matrix is
-        singular.
-        """
+        """The covariance if each coordinate of a corner has this variance. Raises CalibrationError or LinAlgError if
+        the matrix is singular."""
         scale = np.sqrt(np.diag(self.matrix))
         inverse = np.linalg.inv(self.matrix / np.outer(scale, scale)) / np.outer(scale, scale)
         return Covariance(self.names, variance_px2 * (inverse + inverse.T) / 2)
@@ -105,7 +104,7 @@ class CameraProblem:
         return self.board.corners_m[self.corners[view].ids]
 
     def check(self, used: Sequence[Mask]) -> None:
-        """Raise Degenerate if all views show the board at one pose."""
+        """Raise Degenerate if all views show the board at one pose, or if a view's corners give no pose."""
         rough = self._rough(used)
         shown = _of_used(rough.poses, used)
         places = np.stack([pose.to_camera(np.array([*self.board.size_m, 0.0]) / 2) for pose in shown])
@@ -266,8 +265,9 @@ class CameraFit:
     """A camera and the data it was fitted to. Sequences run over the views with enough corners, which `views` names.
 
     residual_px: (n, 2) float64, projected minus seen, of every corner. used: (n,) bool, corners in the fit. rms_px: rms
-    distance of those. outliers: names of the views with more than one corner left out, mirrored ones too. condition:
-    condition number of the normal equations at unit diagonal. spread_rad: largest angle between the boards in the fit.
+    distance of the corners in the fit. outliers: names of the views with more than one corner left out, mirrored ones
+    too. condition: condition number of the normal equations at unit diagonal. spread_rad: largest angle between the
+    boards in the fit.
     """
 
     camera: Camera

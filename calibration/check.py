@@ -1,4 +1,4 @@
-"""A calibration judged by boards that were not used for it: do they come out flat, and of the right size and angle?
+"""Checks a calibration with boards that were not used for it: do they come out flat, and of the right size and angle?
 
 A board at an unknown pose is scanned. The scanned points of each of its squares are averaged; the deviations of these
 averages from their best plane are the flatness error. The board's corners are put on that plane along their rays; the
@@ -43,7 +43,8 @@ class BoardCells:
 
 
 def cells_of(model: RigModel, view: View, board: Board) -> BoardCells:
-    """Means over the squares with enough passages in every sweep. Raises Degenerate if there are too few."""
+    """Means over the squares with enough passages in every sweep. Raises Degenerate for a view without passages or with
+    too few corners, and if too few squares remain."""
     if not view.passages:
         raise Degenerate("no-board", f"view {view.name} has no passages of the line; scan the board with the laser on")
     shape = (board.squares[1], board.squares[0])
@@ -82,9 +83,8 @@ def _points_of(model: RigModel, cells: BoardCells) -> Array:
 
 
 def noise_m2(model: RigModel, cells: BoardCells, normal: Array) -> float:
-    """Variance of a square's mean along the board's normal, from the differences between sweeps. If there is only one
-    sweep, it follows from the sd of the passages.
-    """
+    """Variance (m^2) of a square's mean along the board's unit normal, from the differences between sweeps. If there is
+    only one sweep, it follows from the sd of the passages."""
     found = _triangulated(model, cells.x_px, cells.y_px, cells.command, cells.velocity_per_s) @ normal
     sweeps = len(found)
     if sweeps > 1:
@@ -143,10 +143,10 @@ _PARALLEL = 1e-6
 class CheckedBoard:
     """The result of the scan of one board; lengths in metres.
 
-    distance_m: its mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their plane;
-    expected_m: the rms expected from covariance and noise. chi2, freedom: of the deviations. scale: scanned size over
-    stated size; scale_sd: its expected sd. point_rms_m: rms deviation of single passages from the plane. cells_m:
-    (squares down, across) deviations, NaN where a square was not scanned.
+    distance_m: the board's mean depth. flatness_rms_m, flatness_peak_m: deviations of its squares' means from their
+    plane; expected_m: the rms expected from covariance and noise. chi2, freedom: chi squared of the deviations and its
+    degrees of freedom. scale: scanned size over stated size; scale_sd: its expected sd. point_rms_m: rms deviation of
+    single passages from the plane. cells_m: (squares down, across) deviations, NaN where a square was not scanned.
     """
 
     name: str

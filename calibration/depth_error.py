@@ -1,4 +1,4 @@
-"""The depth error that a calibration leaves: by pixel, from its covariance to first order, and by groups of parameters.
+"""The depth error that a calibration leaves at each pixel, in all and from each group of parameters, to first order.
 
     var z = J C J',    J = dz / d(parameters) of the pixel's ray on the light sheet of its mirror command.
 
@@ -31,7 +31,8 @@ _STEP = 1e-6
 
 
 def propagated(model: RigModel, measure: Callable[[RigModel], Array]) -> tuple[Array, Array]:
-    """measure(model) (n,) and its covariance (n, n) to first order, which is zero for a model without a covariance."""
+    """The values of measure(model), (n,), and their covariance (n, n) to first order, zero for a model without
+    covariance."""
     values = np.atleast_1d(measure(model)).astype(np.float64)
     if model.covariance is None:
         return values, np.zeros((values.size, values.size))
@@ -72,7 +73,7 @@ _INDEPENDENT = 1e-12
 
 
 def group_of(parameter: str) -> str:
-    """The group that a parameter belongs to."""
+    """The group of GROUPS that a parameter belongs to."""
     if parameter in MATRIX or parameter in DISTORTION:
         return "camera"
     if parameter in TIMES:
@@ -277,9 +278,9 @@ _TRUTH_GRID = 32
 class DepthErrors:
     """Errors at the pixels that the true rig lights at one depth and that have a depth in the model; NaN without any.
 
-    median_m, worst_m: of the absolute errors. ratio: root mean square of the errors, each divided by the sd that the
-    model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations. The
-    ratio is NaN also if the model has no covariance.
+    median_m, worst_m: median and largest absolute error. ratio: root mean square of the errors, each divided by the sd
+    that the model's covariance predicts for it. If covariances are right, its square averages 1 over many calibrations.
+    The ratio is also NaN if the model has no covariance.
     """
 
     depth_m: float

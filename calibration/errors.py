@@ -1,5 +1,5 @@
-"""The errors of this package, and what stands in messages: numbers of few digits and, but for condition numbers,
-without powers of ten; text that a terminal can show."""
+"""The errors of this package, and text for messages: numbers with few digits and, except for condition numbers, without
+powers of ten; text that a terminal can show."""
 
 import numpy as np
 
@@ -11,7 +11,8 @@ def plain_text(text: str) -> str:
 
 
 class CalibrationError(ValueError):
-    """Raised for input that cannot be used. One line says what is wrong and, mostly, value, limit and next step."""
+    """Raised for input that cannot be used. Its text is one line: what is wrong and, if possible, value, limit and next
+    step."""
 
 
 class Degenerate(CalibrationError):  # noqa: N818, the input is, not the program
@@ -36,7 +37,8 @@ class FileError(CalibrationError):
 
 
 def digits(value: float, count: int = 3) -> str:
-    """A number rounded to `count` significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for NaN."""
+    """A number rounded to `count` significant digits: 1234.5 is '1230', 0.000012345 is '0.0000123'; '-' for NaN, 'inf'
+    for infinity."""
     if not np.isfinite(value):
         return "-" if np.isnan(value) else f"{value:g}"
     value = value + 0.0  # -0 is 0
@@ -44,7 +46,8 @@ def digits(value: float, count: int = 3) -> str:
 
 
 def condition_text(condition: float) -> str:
-    """The text of a condition number with two digits and a power of ten, as '3.1e+07'; 'inf' if it is not finite."""
+    """The text of a condition number with two digits and a power of ten, such as '3.1e+07'; 'inf' if it is not
+    finite."""
     return f"{condition:.1e}" if np.isfinite(condition) else "inf"
 
 

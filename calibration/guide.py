@@ -1,4 +1,4 @@
-"""Advice on the board's next pose, and why: the pose after which the expected depth error is smallest.
+"""Advises on the board's next pose: the one after which the expected depth error is smallest.
 
 Candidates form a grid of distance, place in the picture and tilt. `Forecast` predicts the gain of each from the fit of
 the views so far. Before there is a fit, and throughout a calibration without guidance, the poses of `sequence` are
@@ -65,7 +65,8 @@ ExpectedError = Callable[[BoardPose], float]
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A pose to show. fill: one of FILLS. distance_m: depth of the board's middle. place, tilt: from PLACES, TILTS."""
+    """A pose to show. fill: one of FILLS. distance_m: depth of the board's middle. place, tilt: keys of PLACES and
+    TILTS."""
 
     fill: float
     distance_m: float
@@ -113,7 +114,10 @@ def candidates(camera: Camera, board: Board, depth_range_m: tuple[float, float])
 
 
 def next_pose(choices: Sequence[Candidate], at_m: float, now_m: float, forecast: ExpectedError) -> Advice:
-    """The best of the given poses (at least one) by the forecast, as the next pose; the first one if all are NaN."""
+    """The best of the given poses (at least one) by the forecast, as the next pose; the first one if all are NaN.
+
+    now_m: the expected depth error at `at_m` without another pose.
+    """
     errors = [forecast(candidate.pose) for candidate in choices]
     best = int(np.nanargmin(errors)) if np.isfinite(errors).any() else 0
     return Advice(choices[best], at_m, now_m, float(errors[best]))

@@ -294,11 +294,12 @@ class PixelDrift:
     """The change from an older map to a newer one.
 
     became_hot, became_dead, recovered: (n, 2) row and column; recovered ones were hot. Hot and recovered ones count
-    only if the change is more than chance, dead ones only if both maps were made with light. ratio: of the ordinary
-    pixels' rates, newer to older; ratio_sigma: its distance from 1 in sd. They are 1 and 0 without such rates. changed:
-    share of the pixels whose rates differ by more than chance after this factor is removed. correlation: of the
-    logarithms of rates above 0; NaN for fewer than two pixels, or if all of one map are equal. alike: share of the old
-    hot pixels that are still hot, None if too few. new_defects: share of all pixels that became hot or dead.
+    only if the change is more than chance, dead ones only if both maps were made with light. ratio: ratio of the
+    ordinary pixels' rates, newer to older; ratio_sigma: its distance from 1 in sd. They are 1 and 0 without such rates.
+    changed: share of the pixels whose rates differ by more than chance after this factor is removed. correlation:
+    correlation of the logarithms of rates above 0; NaN for fewer than two pixels, or if all of one map are equal.
+    alike: share of the old hot pixels that are still hot, None if too few. new_defects: share of all pixels that became
+    hot or dead.
     """
 
     became_hot: NDArray[np.int64]

@@ -21,7 +21,8 @@ AT_M: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class AccuracyGoal:
-    """The required quality of a calibration: sd of depth at a distance, and the baseline if it was measured."""
+    """The required quality of a calibration: the largest sd of depth at the distance `at_m`, and the baseline if it was
+    measured."""
 
     accuracy_m: float
     at_m: float = AT_M
@@ -45,7 +46,8 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a calibration may be used, and why not; of a fit, the most likely root cause comes first."""
+    """Whether a calibration may be used, and why not. The reasons against a fit begin with the most likely root
+    cause."""
 
     passed: bool
     reasons: tuple[Reason, ...] = ()

@@ -75,9 +75,8 @@ class Passages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One pose of the board as seen and scanned. corners: None if not found. passages: of each sweep. picture: (height,
-    width) float32, photons per pixel and exposure, or grey levels if it comes from an image file.
-    """
+    """One pose of the board as seen and scanned. corners: None if not found. passages: one for each sweep. picture:
+    (height, width) float32, photons per pixel and exposure, or grey levels if it comes from an image file."""
 
     name: str
     corners: Corners | None

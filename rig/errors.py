@@ -71,7 +71,8 @@ class RecordingError(RigError):
 
 
 class DivergedError(RigError):
-    """Raised after a replay in which a driver sent its device something other than was recorded, or at another time."""
+    """Raised after a replay in which a driver sent its device something other than what was recorded, or at another
+    time."""
 
 
 class DamagedRecordingError(RigError):

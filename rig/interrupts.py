@@ -14,10 +14,11 @@ _at_end: ContextVar[ExitStack | None] = ContextVar("_at_end", default=None)
 
 @contextmanager
 def one_interrupt() -> Iterator[None]:
-    """A context for work that an interrupt ends in order; the work calls `ignore_interrupts` once it was interrupted.
+    """A context for work that an interrupt ends in order. The work calls `ignore_interrupts` once it has been
+    interrupted.
 
-    From then to the end of the outermost such context, further interrupts are ignored. `timeout` sends its signal
-    twice, and impatient people press Ctrl-C again, while results are still being written.
+    From then until the outermost of nested contexts ends, further interrupts are ignored, so that results can still be
+    written: the command `timeout` sends its signal twice, and impatient people press Ctrl-C again.
     """
     if _at_end.get() is not None:
         yield
@@ -31,7 +32,8 @@ def one_interrupt() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Ignore interrupts from now to the end of the outermost `one_interrupt`, or of the program if there is none.
+    """Ignore Ctrl-C and the signals ENDING from now to the end of the outermost `one_interrupt`, or, if there is none,
+    of the program.
 
     Outside the main thread, which alone gets signals, nothing changes.
     """

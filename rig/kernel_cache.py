@@ -1,8 +1,8 @@
 """Gives numba a folder for compiled kernels, and removes kernels that are out of date.
 
 Service accounts and containers often have no folder in which numba can store kernels. numba then refuses to compile at
-all, so `prepare_kernels` provides a folder. It also does where the program lies on a network disk, which computers with
-different processors share: each gets kernels of its own, on a disk of its own.
+all, so `prepare_kernels` provides a folder. It also provides one if the program lies on a network disk. Computers that
+share that disk may have different processors, so each gets kernels of its own, on a disk of its own.
 
 numba compiles a kernel anew if the kernel's own file has changed, but not if a function that it inlines from another
 file has. After an update, such kernels would silently run old code. So `prepare_kernels` stores a digest for each
@@ -31,8 +31,8 @@ NOTE = "spadrig-kernels-{}.json"
 
 
 def prepare_kernels() -> None:
-    """Give numba a folder that it can write to, remove stale kernels, and let it do without torn ones. Call this before
-    numba is imported."""
+    """Give numba a folder that it can write to (in the environment variable `VARIABLE`, where necessary), remove stale
+    kernels, and make numba compile anew what damaged files do not give. Call this before numba is imported."""
     forgive_kernel_files()
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if VARIABLE not in os.environ and not _serves(TOP / "rig" / "__pycache__"):
@@ -42,10 +42,10 @@ def prepare_kernels() -> None:
 
 
 def forget_stale(top: Path, kept: Path | None) -> None:
-    """Remove the kernels of modules of PACKAGES in `top` that have changed since the last call, or whose imports have.
+    """Remove the kernels of every module that has changed since the last call, or that imports a changed module.
 
-    kept: numba's folder; None if kernels lie beside their modules. If the digests cannot be stored, as on a full disk,
-    the next call removes the same kernels again.
+    top: the folder that holds the packages PACKAGES. kept: numba's folder; None if kernels lie beside their modules. If
+    the digests cannot be stored, as on a full disk, the next call removes the same kernels again.
     """
     sources = sorted(file for package in PACKAGES for file in _sources(os.path.join(top, package)))
     seen = _digest("".join(f"{path} {changed_ns} {size}\n" for path, changed_ns, size in sources).encode())

@@ -1,9 +1,9 @@
 """Lets numba do without files of compiled kernels that are torn, mixed up or cannot be written.
 
-A loss of power may leave such a file empty or cut off, and numba then raises whatever its reader does, at every start.
-On a full disk it refuses to go on. And two processes that compile at once may note different signatures of one kernel
-for the same file; numba would call code that was made for other types. In all these cases the kernel is compiled anew,
-which only takes time.
+A loss of power may leave such a file empty or cut off; numba would then fail to read it at every start. On a full disk
+numba refuses to go on. And if two processes compile at once, the index of kernels may name one file for two signatures
+of a kernel; numba would call code that was made for other types. In all these cases the kernel is compiled anew, which
+only takes time.
 """
 
 import importlib.util
@@ -23,7 +23,10 @@ _SIGNATURE = 3
 
 
 def forgive_kernel_files() -> None:
-    """Let numba, now or once it is imported, compile what its files do not give."""
+    """Make numba compile a kernel anew, instead of failing, if the kernel's files cannot be used.
+
+    If numba is not imported yet, the change takes effect when it is.
+    """
     if _CACHING in sys.modules:
         _forgive(sys.modules[_CACHING])
     elif not any(isinstance(finder, _WhenImported) for finder in sys.meta_path):

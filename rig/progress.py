@@ -22,7 +22,7 @@ class Step:
     """A report of progress.
 
     total: None if it is not known; otherwise `done` never exceeds it.
-    unit: of the counts, in the plural.
+    unit: the unit of `done` and `total`, in the plural.
     note: further text.
     part: the part of the command that the stage belongs to, such as 'pose 3 of 12'.
     """
@@ -42,14 +42,15 @@ _part: ContextVar[str] = ContextVar("part", default="")
 
 
 def tell_stage(stage: str, done: int = 0, total: int | None = None, unit: str = "", note: str = "") -> None:
-    """Report the present stage of this thread's work."""
+    """Report the present stage of this thread's work to its listener; does nothing without one."""
     listener = _listener.get()
     if listener is not None:
         listener(Step(stage, done if total is None else min(done, total), total, unit, note, _part.get()))
 
 
 def counted(stage: str, unit: str, progress: Progress | None = None) -> Progress:
-    """A callback that reports its counts as progress of this stage, and passes them on to `progress`."""
+    """A callback that reports its counts as progress of this stage, and passes them on to `progress`. Both get at most
+    the total as what is done."""
 
     def count(done: int, total: int) -> None:
         tell_stage(stage, done, total, unit)
@@ -71,7 +72,8 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """A context in which all reports carry the name of this part. The first report is the stage PREPARING."""
+    """A context in which all reports of this thread carry the name of this part. It begins with a report of the stage
+    PREPARING."""
     token = _part.set(name)
     tell_stage(PREPARING)
     try:

@@ -1,7 +1,7 @@
 """Wall time, divided among the work that goes on at each moment.
 
 Counting and several maps run at the same time. If each stated its own wall time, the sum would be longer than the scan.
-So each is charged an n-th of the time during which n of them run: the sum is the time during which any of them ran.
+So while n pieces of work run, each is charged an n-th of the time. The sum is the time during which any of them ran.
 """
 
 import threading
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 
 class ChargedTime:
-    """Time in s that was charged to a piece of work; 0 until it is over."""
+    """Time in s that was charged to a piece of work; 0 until the work is over."""
 
     seconds = 0.0
 
@@ -28,7 +28,8 @@ class SharedTime:
 
     @contextmanager
     def charge(self) -> Iterator[ChargedTime]:
-        """Charge the work of a `with` block; its time is known afterwards."""
+        """A context whose work is charged. It gives a `ChargedTime`, which holds the time after the context has
+        ended."""
         spent = ChargedTime()
         begun_s = self._step(1)
         try:

@@ -50,8 +50,8 @@ class RowWorkers:
     """Threads that share the rows of a picture. Each always gets the same rows, which may still be in its core's cache.
 
     `post` queues work: each thread does its part in order and none waits for the others. If work fails, all that has
-    not begun is dropped, and the next call raises the error. With one thread, `post` does the work itself, at once.
-    The threads end with `close`, or when nothing refers to the workers any more.
+    not begun is dropped, and the next call of `over`, `post` or `settle` raises the error. With one thread, `post` does
+    the work itself, at once. The threads end with `close`, or when nothing refers to the workers any more.
     """
 
     def __init__(self, threads: int) -> None:
@@ -175,16 +175,17 @@ class StageThread:
         self._thread.start()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the thread's end. Returns False if it does not come in time, True if the thread was not started."""
+        """Wait at most `timeout_s` for the thread's end. Returns False if it still runs, True if it ended or was never
+        started."""
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
 
 def all_at_rest(within_s: float) -> bool:
-    """Wait until no thread of this module is at work, at most so long; False if one still is.
+    """Wait until no thread of this module is at work, at most `within_s` seconds; returns False if one still is.
 
-    The interpreter must not end before: it takes away what compiled code still uses, and the process would crash.
+    The interpreter must not end before that: it takes away what compiled code still uses, and the process would crash.
     """
     ends_s = time.monotonic() + within_s
     while any(each.is_alive() for each in list(_stages)) or any(each.at_work for each in list(_workers)):

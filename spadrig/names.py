@@ -30,8 +30,7 @@ def require_own_names() -> None:
 
 def intruder(top: str = TOP) -> str | None:
     """A sentence with the path of the first module that has taken the name of one of ours, and the next step; None if
-    all names lead to ours. top: the folder of ours.
-    """
+    all names lead to ours. top: the folder that holds our packages."""
     for name in NAMES:
         ours = os.path.join(top, name, "__init__.py")
         spec = _spec_of(name)

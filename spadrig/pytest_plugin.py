@@ -1,7 +1,7 @@
 """The plug-in of pytest: default fixtures of the conformance suites, and detailed messages of their failed assertions.
 
-A package gives the suites its devices by fixtures of these names. Without one, the fixture here says what to write.
-pytest loads this module in every run, whatever is tested, so it imports nothing of the project.
+A package hands its devices to the suites in fixtures with these names. If it lacks one, the fixture here fails the test
+and says what to write. pytest loads this module in every run, whatever is tested, so it imports nothing of the project.
 """
 
 from collections.abc import Callable, Iterator

@@ -120,7 +120,7 @@ class Board:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """(width, height) of the squares, without the paper around them."""
+        """(width, height) in metres of all squares together, without the paper around them."""
         return self.squares[0] * self.square_m, self.squares[1] * self.square_m
 
     def albedo_at(self, x_m: ArrayLike, y_m: ArrayLike) -> Array:

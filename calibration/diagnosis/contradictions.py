@@ -47,9 +47,9 @@ NOISE_SIGMAS = 4.0
 class SweepWaves:
     """Waves of the sweeps of each view.
 
-    rms: of the waves in command units, without the noise; noise: the largest rms that may be noise; both are NaN if
-    there are too few passages. command: (BINS,) middles of bins. sweeps: (sweeps, BINS) medians of the residuals, NaN
-    where there are too few passages.
+    rms: root mean square of the waves in command units, without the noise; noise: the largest rms that may be noise;
+    both are NaN if there are too few passages. command: (BINS,) middles of bins. sweeps: (sweeps, BINS) medians of the
+    residuals, NaN where there are too few passages.
     """
 
     rms: float
@@ -147,7 +147,7 @@ MOST_UNEXPLAINED = 0.35
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewShift:
     """Shift of one view in command units: the median distance of its passages from the light planes, with its sign; sd:
-    from the pose's noise."""
+    its standard deviation due to the pose's noise."""
 
     name: str
     shift: float
@@ -155,7 +155,7 @@ class ViewShift:
 
 
 def view_shifts(fit: RigFit, views: dict[str, View]) -> tuple[ViewShift, ...]:
-    """The shifts of all views of a fit that have passages and enough corners. views: by name."""
+    """The shifts of all views of a fit that have passages and enough corners. views: all views of the fit, by name."""
     shifts = []
     for name, pose, sweeps in zip(fit.views, fit.poses, fit.sweeps, strict=True):
         found = _corner_pose(fit, views[name], pose)

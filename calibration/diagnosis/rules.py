@@ -1,4 +1,4 @@
-"""Is a calibration good enough, and if not, why: the evidence, and a verdict whose limits are depth errors.
+"""Judges whether a calibration is good enough, and if not, why. The limits of the verdict are depth errors.
 
 Each number of the evidence reveals one possible mistake: how many poses there were, how far they were tilted, how large
 the board appeared, how much of the picture it reached, how bright the room was, how long the baseline came out.
@@ -12,8 +12,8 @@ is the most likely root cause. Their order is:
 3. A baseline that differs from the stated one: the whole scene is then too large or too small. If the predicted error
 is too large, this comes after 4, since a baseline is only as good as the fit it comes from.
 4. Too little data (room light, too few poses, no tilt, boards too far away, corners in only a part of the picture).
-This is a likely cause if the predicted error is too large. It counts even if the predicted error is small enough: if
-that is due to the assumed model, hardly any data are left to check the model.
+This is a likely cause if the predicted error is too large. It counts even if the predicted error is small enough: a
+small error may then come from the assumed model alone, and hardly any data are left to check the model.
 
 If the error is too large and the data have none of these faults, there are simply too few of them. Last come faults
 that the predicted error does not show: sweeps whose directions and speeds do not determine a lag for a direction of the
@@ -62,9 +62,8 @@ class ViewEvidence:
 
 @dataclass(frozen=True, slots=True)
 class PoseEvidence:
-    """Evidence from the poses: largest angle between two boards, median distance, median angle that a board's longer
-    side fills; NaN without poses.
-    """
+    """Evidence from the poses; NaN without poses. tilt_rad: largest angle between two boards. distance_m: median
+    distance. board_rad: median angle that a board's longer side fills."""
 
     tilt_rad: float
     distance_m: float
@@ -239,10 +238,10 @@ _SPEEDS = "scan both ways (scan.bidirectional), at two speeds or more (scan.expo
 
 
 def lag_lack(velocities_per_s: Sequence[float], *, mean_will_do: bool) -> list[Reason]:
-    """Reasons why sweeps do not determine both lags.
+    """Reasons why sweeps do not determine both lags; none if there are no sweeps.
 
-    mean_will_do: whether the mean of the lags is enough, as for planes: they are then right for sweeps at one speed in
-    both directions.
+    mean_will_do: whether the mean of the lags is enough. For planes it is if all sweeps run at one speed, in both
+    directions.
     """
     ways = {velocity > 0 for velocity in velocities_per_s}
     if not ways:
@@ -277,7 +276,7 @@ class FitEvidence:
     noise. shift_m: depth error of a view against the others; shift_noise_m: its largest value that may be noise;
     moved_after: the view after which the rig moved, if one move explains the shifts. misfit: factor by which the
     variances were increased because the data contradict each other. baseline_m, baseline_sd_m: distance from camera to
-    mirror axis, and its sd. velocities_per_s: of the sweeps, signed; empty if unknown.
+    mirror axis, and its sd. velocities_per_s: signed velocities of the sweeps; empty if unknown.
     """
 
     poses: PoseEvidence

@@ -1,8 +1,8 @@
 """The verdicts on a fit of the camera alone, on a fit of the rig, on lags, and on a check.
 
-A camera is judged by how accurately it knows the directions of rays, in pixels. A camera whose rays are all turned by
-one angle is as good as before, since the mirror is calibrated with it. So the variance of a pixel is J C J', with C the
-covariance and J the derivatives of the pixels by the parameters, from which the best common rotation of all rays is
+A camera is judged by how accurately the directions of its rays are known, in pixels. A camera whose rays are all turned
+by one angle is as good as before, since the mirror is calibrated with it. So the variance of a pixel is J C J', with C
+the covariance and J the derivatives of the pixels by the parameters, from which the best common rotation of all rays is
 removed.
 
 Lag and row delay are judged by the depth error that their uncertainty causes. A check fails if its errors are larger
@@ -118,8 +118,8 @@ def judge_check(
 
     asked: the required depth error at one distance. For flatness and angle the error allowed at another distance grows
     with the square of the distance; the size of a board may be wrong by the share accuracy_m / at_m at any distance.
-    board_width_m: of the boards. angle, stated_angle_rad: the angle between two boards as scanned, and as measured by
-    hand.
+    board_width_m: width of the boards. angle, stated_angle_rad: the angle between two boards as scanned, and as
+    measured by hand.
     """
     found: list[Reason] = []
     for board in boards:
@@ -255,8 +255,7 @@ def judge_sync(
     fit: SyncFit, model: RigModel | None, asked: AccuracyGoal | None, changed: Reason | None = None
 ) -> Verdict:
     """Judge a fit of lags. model, asked: None if the lag's effect on depth is unknown. changed: why the model is wrong
-    with these lags, or None.
-    """
+    with these lags, or None. Raises CalibrationError if the line does not reach `asked.at_m`."""
     found = []
     if not fit.steady:
         text = (

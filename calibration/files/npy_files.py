@@ -38,7 +38,8 @@ def load_array(file: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def load_arrays(file: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of a .npz file by name. Raises errors as `load_array` does."""
+    """The arrays of a .npz file by name. Raises OSError if it cannot be opened, ValueError (one line) if it holds no
+    arrays."""
     loaded = _load(Path(file))
     if not isinstance(loaded, dict):
         raise ValueError("it is a single array, not an archive of arrays")

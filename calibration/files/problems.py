@@ -50,8 +50,8 @@ _WORDS = {True: "true", False: "false", None: "null"}
 
 @dataclass(frozen=True)
 class ValueSources:
-    """The origin of values: a file with the line of each key, and the keys given as options, with the options'
-    names."""
+    """The origin of values. file: name of a file, for messages. lines_of: gives the line of each key in it. options:
+    keys whose values were given as options. flags: the options' names, by key."""
 
     file: str
     lines_of: Callable[[], Mapping[Key, int]] = dict
@@ -68,7 +68,8 @@ class ValueSources:
         return next((self.lines[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.lines), None)
 
     def flag(self, key: Key) -> str | None:
-        """The option by which the value of a key was given, if that has a name of its own; else None."""
+        """The name of the option by which the value of a key was given; None if it was given otherwise or the option
+        has no name."""
         return f"`{self.flags[key]}`" if self._is_option(key) and key in self.flags else None
 
     def place(self, key: Key) -> str:

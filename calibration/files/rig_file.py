@@ -95,7 +95,7 @@ def _read(file: Path, what: str, model: type[File]) -> File:
 
 
 def load_camera(path: Path) -> KnownCamera:
-    """Read a camera file. Raises CalibrationError, with one line."""
+    """Read a camera file. Raises CalibrationError, with one line, if it is unreadable or invalid."""
     parsed = _read(path, "a camera", _CameraFile)
     try:
         covariance = Covariance(tuple(parsed.covariance.names), np.array(parsed.covariance.matrix, dtype=np.float64))

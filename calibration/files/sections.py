@@ -169,7 +169,7 @@ class YamlFile:
 def load_yaml(file: Path, what: str, example: str, name: str | None = None) -> YamlFile:
     """Read the keys and values of a YAML file. what: its kind for messages, such as 'a calibration'. example: an entry
     to show in messages. name: the file's name in messages, by default its path. Raises FileError if the file cannot be
-    read, is larger than MAX_BYTES, is no YAML in UTF-8, holds no keys and values, or gives a key twice."""
+    read, exceeds a limit of this module, is no YAML in UTF-8, holds no keys and values, or gives a key twice."""
     name = str(file) if name is None else name
     if "\0" in str(file):
         raise FileError(f"cannot read {what.split()[-1]} {plain_text(name)}: it is no path; correct it")

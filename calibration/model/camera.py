@@ -298,8 +298,8 @@ class Camera:
         return du / fx, dv / fx
 
     def project(self, points_m: ArrayLike) -> tuple[Array, Array]:
-        """Raw pixel (x_px, y_px) of points (..., 3) in metres; NaN behind the camera and beyond the lens
-        model's fold."""
+        """Raw pixel (x_px, y_px) of points (..., 3) in metres, even outside the picture; NaN behind the camera and
+        beyond the lens model's fold."""
         points = np.asarray(points_m, np.float64)
         with np.errstate(all="ignore"):
             z = np.where(points[..., 2] > 0, points[..., 2], np.nan)

@@ -150,9 +150,8 @@ SPEED_MARGIN: Final = 0.05
 
 
 def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
-    """The lags that sweeps determine, in groups with one value each. Both are in one group if they cannot be separated;
-    there is no group if neither can be determined.
-    """
+    """The names of the lags that sweeps determine, in groups with one value each. Both are in one group if they cannot
+    be separated; there is no group if neither can be determined."""
     velocity = np.asarray(velocities_per_s, np.float64)
     up, down = velocity[velocity > 0], -velocity[velocity < 0]
     several = _several(up) or _several(down)
@@ -162,7 +161,7 @@ def lag_groups(velocities_per_s: ArrayLike) -> tuple[tuple[str, ...], ...]:
 
 
 def one_speed(velocities_per_s: ArrayLike) -> bool:
-    """Whether all sweeps ran at the same speed, in either direction."""
+    """Whether all sweeps ran at the same speed, within ALIKE_SPEEDS, in either direction."""
     return not _several(np.abs(np.asarray(velocities_per_s, np.float64)))
 
 
@@ -181,7 +180,7 @@ def untold(velocities_per_s: Sequence[float]) -> Array:
 
 def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
     """(n,): a group number for each speed, whatever its direction. Neighbouring speeds that differ by at most
-    ALIKE_SPEEDS share a group."""
+    ALIKE_SPEEDS, relative to the faster one, share a group."""
     speeds, which = np.unique(np.abs(np.asarray(speeds_per_s, np.float64)), return_inverse=True)
     apart = np.diff(speeds, prepend=speeds[:1]) > ALIKE_SPEEDS * speeds
     return np.cumsum(apart, dtype=np.int64)[which.reshape(-1)]

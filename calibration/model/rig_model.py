@@ -68,9 +68,9 @@ class Lag(NamedTuple):
 class Identity:
     """The rig, date and verdict of a calibration. Programs check them before they use the model.
 
-    rig: hash of the relevant part of the rig's config. name: the rig's name. created: date and time, ISO 8601. kinds,
-    serials: of the devices by slot (spad, scanner, ...), if known. verdict, reasons: of the calibration and of its last
-    check; None and () if there was none.
+    rig: hash of kinds and serials. name: the rig's name. created: date and time, ISO 8601. kinds, serials: those of the
+    devices by slot (spad, scanner, ...), if known. verdict: that on the calibration when it was made, None if it was
+    not judged. reasons: codes of the reasons against it.
     """
 
     rig: str
@@ -93,7 +93,7 @@ class RigModel:
     row_delay_s: delay of each row's exposure after that of the row above. gate_delay_s: delay of the light after the
     gate's edge. colour_skew_s: time by which the scanner's gate output precedes its mirror. marker_rising: whether the
     rising edge of a scan marker counts, rather than the falling one.
-    covariance: of the parameters that were estimated, None if unknown. identity: None if it was not recorded.
+    covariance: that of the estimated parameters, None if unknown. identity: None if it was not recorded.
     Raises CalibrationError for a lag below 0, a time that is not finite, a map of another size than the camera's, and
     planes within 45 degrees of the image row, since they give no position along the row.
     """
@@ -140,7 +140,8 @@ class RigModel:
         return np.asarray(getattr(self.scanner, "command", np.linspace(*self.scanner.command_range, 33)))
 
     def planes(self, commands: ArrayLike) -> Array:
-        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...). Raises as `Scanner.planes`."""
+        """Light planes (..., 4) = nx, ny, nz, d (metres) for mirror commands (...). Raises CalibrationError outside the
+        command range."""
         return self.scanner.planes(commands)
 
     def sheets(self, commands: ArrayLike) -> LightSheets:
@@ -151,8 +152,8 @@ class RigModel:
         """Position of the mirror, on the command's scale, when row y sees the light.
 
         commands: those at the time when the first row is exposed; a later row sees the mirror farther on.
-        velocity_per_s: of the command, positive while it rises; the lag is that of its direction. All arguments
-        broadcast.
+        velocity_per_s: the command's velocity, positive while it rises; the lag is that of this direction. All
+        arguments broadcast.
         """
         velocity = np.asarray(velocity_per_s, np.float64)
         lag_s = np.where(velocity < 0, self.lag_s.backward, self.lag_s.forward)

@@ -67,9 +67,9 @@ class ColumnSums:
         return ColumnSums(self.ones[:, which], self.frames if self.frames.shape[1] == 1 else self.frames[:, which])
 
     def between(self, begin: int, end: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """For each column, the share of 1s (columns, pixels) over the columns from `begin` to before `end` relative to
-        it, NaN without frames; and the number of frames, (columns, pixels or 1).
-        """
+        """The share of 1s (columns, pixels) in a range of columns around each column, NaN without frames; and the
+        number of frames in the range, (columns, pixels or 1). begin, end: the first column of the range and the one
+        after its last, relative to the column."""
         edges = np.arange(self.columns)
         first, last = (np.clip(edges + shift, 0, self.columns) for shift in (begin, end))
         frames = (self.frames[last] - self.frames[first]).astype(np.float32)
@@ -118,7 +118,7 @@ def evenly(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """(n, 2) row and column of the pixels in a mask (height, width), in the order of Bayer's dither matrix.
 
     The order goes from coarse to fine: pixels whose row and column are multiples of 4 come before the other pixels
-    whose row and column are even. It follows from the bits of y xor x and of y in turn, the lowest bit first.
+    whose row and column are even. The order follows from the bits of y xor x and of y in turn, the lowest bit first.
     """
     rows, columns = np.nonzero(mask)
     bits = max(1, int(max(mask.shape) - 1).bit_length())
@@ -163,9 +163,9 @@ GROUPS = 4
 class SweepCounts:
     """The counts of a sweep.
 
-    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), frames of each.
-    command: (columns,), their mean mirror command, not corrected for lags; NaN for columns without frames. x0:
-    (columns,), first pixel of each column's window. width: of the picture, in pixels.
+    counts: (columns, rows, window), 1s of each pixel over the frames of a column. n_frames: (columns,), number of
+    frames. command: (columns,), mean mirror command of these frames, not corrected for lags; NaN for columns without
+    frames. x0: (columns,), first pixel of each column's window. width: width of the picture in pixels.
     """
 
     counts: Counts
@@ -221,8 +221,7 @@ def find_passages(
     most: int = MOST_PASSAGES,
 ) -> Passages:
     """Passages of at most `most` pixels of a mask (rows, width), by default of any pixels; none if the line is not
-    visible. direction, speed_per_s: of the sweep, as in `Passages`.
-    """
+    visible. direction, speed_per_s: those of the sweep, as in `Passages`."""
     rows = sweep.counts.shape[1]
     pixels = evenly(np.ones((rows, sweep.width), np.bool_) if mask is None else mask)
     kept: list[tuple[NDArray[np.int64], Array, Array]] = [(pixels[:0], np.empty(0), np.empty(0))]
@@ -411,8 +410,8 @@ def even_pixels(picture: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def board_pixels(corners: Corners, board: Board, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """True on the squares of a board whose corners were found (4 at least), and on the paper around. size: (height,
-    width) of the result."""
+    """True on the squares of a board whose corners were found (4 at least), and on the paper around; all False if no
+    homography fits the corners. size: (height, width) of the result."""
     at_m = board.corners_m[corners.ids][:, :2]
     homography, _ = cv2.findHomography(at_m, corners.px, method=0)
     mask = np.zeros(size, np.uint8)

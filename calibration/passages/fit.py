@@ -45,8 +45,7 @@ class LineShape:
 
 
 def light(theta: Array, at: Array, shape: LineShape) -> tuple[Array, Array]:
-    """Flux (pixels, columns), and its derivatives (pixels, 5, columns), of which the last is by the logarithm
-    of sigma."""
+    """Flux (pixels, columns) at the columns' positions `at`, and its derivatives (pixels, 5, columns) by `theta`."""
     before, after, area, centre, log_sigma = (theta[:, i, None] for i in range(5))
     sigma, away = np.exp(log_sigma), at - centre
     if shape.travels:
@@ -154,10 +153,10 @@ SIGMA_SPREAD = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassageFit:
-    """One entry per pixel, in columns. centre, sd: of the passage. sigma: of the pixel's group.
+    """One entry per pixel. centre, sd: those of the passage, in columns. sigma: that of the pixel's group, in columns.
 
-    significance: of the line against levels alone, in standard deviations (the square root of twice the logarithm of
-    the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: the
+    significance: that of the line against levels alone, in standard deviations (the square root of twice the logarithm
+    of the likelihood ratio). misfit: Pearson's chi squared, as standard deviations above its mean. likelihood: the
     log-likelihood. settled: whether the counts determine the centre; if not, centre and sd mean nothing.
     """
 
@@ -178,8 +177,8 @@ def fit_passages(
 
     ones, frames, at: (pixels, columns) float64, 1s, frames and position of each column; frames are 0 if there are none.
     The first and the last column stand for everything far away on their side. start: (pixels,) first guess of the
-    passage. group: (pixels,) part of the picture, from 0 on. shape: of the line's light. exact: take centre and `sd`
-    from the whole likelihood rather than from the parabola at its top.
+    passage. group: (pixels,) part of the picture, from 0 on. shape: shape of the line's light. exact: take centre and
+    `sd` from the whole likelihood rather than from the parabola at its top.
     """
     theta = _start(ones, frames, at, start)
     damping = np.full(len(start), DAMPING)

@@ -40,7 +40,7 @@ MOST_ODD_SHARE = 1 / 3
 
 @dataclass
 class Rounds:
-    """The state of alternately fitting and deciding.
+    """The state of a fit that alternates between fitting and deciding.
 
     base: groups of parameters, with one value each, that are free at the beginning; free: those free now. decisions:
     the latest ones about terms; kept: those that changed the model.
@@ -60,7 +60,8 @@ class Rounds:
         self.free = list(self.base)
 
     def run(self) -> None:
-        """Fit and decide until nothing changes or rounds are over. Raises Degenerate or LinAlgError, as `solved`."""
+        """Fit and decide until nothing changes, or for MOST_ROUNDS. Raises Degenerate or LinAlgError as `solved` does,
+        and Degenerate for a lag clearly below 0."""
         idle = 0
         for _ in range(MOST_ROUNDS):
             self.solution = solved(self.problem, self.state, self.noise, roughly=idle == 0)
@@ -164,8 +165,8 @@ def sweep_fits(seen: rig_state.Sighting, residual: Array, timing: Array) -> tupl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFit:
-    """A fitted rig. Of each view, in the order of `views`: poses; corner_residual_px, (n, 2), predicted minus seen; and
-    sweeps.
+    """A fitted rig. poses, corner_residual_px and sweeps have one entry for each view, in the order of `views`.
+    corner_residual_px: (n, 2), predicted minus seen.
 
     left_out: names of views without enough corners; outliers: names of views that do not fit the others and were not
     used. noise: estimated from the residuals; corner_scale: median sd of the corners as a multiple of
@@ -211,7 +212,7 @@ class RigFit:
 
     @property
     def corner_rms_px(self) -> float:
-        """Root mean square of all corners' distances."""
+        """Root mean square distance, in pixels, of all corners from where the fit puts them."""
         return rms(np.concatenate(self.corner_residual_px))
 
 

@@ -46,7 +46,8 @@ class TermDecision:
 
 
 def candidates(free: Sequence[Sequence[str]], row_delay: bool) -> list[tuple[str, ...]]:
-    """Sets of terms that could be added next; the last of each is judged. row_delay: whether that may be a term."""
+    """Sets of terms that could be added next; the last of each is judged. row_delay: whether the row delay may be
+    one."""
     names = {name for group in free for name in group}
     order = max(k for k in range(ANGLE_TERMS) if f"angle_{k}" in names)
     tried = [tuple(f"angle_{k}" for k in range(order + 1, top + 1)) for top in range(order + 1, order + 3)]

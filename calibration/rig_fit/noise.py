@@ -45,7 +45,7 @@ class Noise:
     """The noise of a fit. corner_sd_px: sd of each coordinate of a corner whose `Sighting.corner_scale` is 1.
     passage_factor: factor on passages' sd.
 
-    jitter_sd: of the mirror, in command units; reach: largest difference of commands over which it is shared.
+    jitter_sd: sd of the mirror's jitter, in command units; reach: largest difference of commands that share it.
     """
 
     corner_sd_px: float

@@ -155,8 +155,8 @@ def _on_board(sweep: Passages, board: Board, camera: Camera, pose: BoardPose) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigState:
-    """The model with lags of 0; timing (3,): both lags and row delay in s, of any sign; per view poses and rays
-    (2, m)."""
+    """The state of a fit. model: has lags of 0. timing (3,): both lags and row delay in s, of any sign. poses, rays:
+    one entry for each view; rays (2, m): u and v of the pixels of its passages."""
 
     model: RigModel
     timing: Array

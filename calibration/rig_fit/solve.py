@@ -92,7 +92,7 @@ def all_rows(state: RigState, sightings: Sequence[Sighting], terms: Terms) -> li
 
 
 def normals(rows: Sequence[tuple[Rows, Rows]], weight: Sequence[Weights], jitter: float) -> list[ViewNormal]:
-    """The normal equations of each view. jitter: variance."""
+    """The normal equations of each view. jitter: variance of the mirror's jitter, in squared command units."""
     return [view_normal(*pair, of_view, jitter) for pair, of_view in zip(rows, weight, strict=True)]
 
 
@@ -160,7 +160,7 @@ class RigProblem:
     """The data and the parameters of a fit.
 
     tie: (p, q) maps free parameters to shared ones. counted: (views,), False if a view has its own pose but does not
-    influence the shared parameters. prior: on the camera's terms, or None.
+    influence the shared parameters. prior: knowledge about the camera's terms, or None.
     """
 
     sightings: tuple[Sighting, ...]
@@ -172,9 +172,9 @@ class RigProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSolution:
-    """A state with its residuals, the equations of all shared parameters (p, p), (p,), and the condition of the free
-    ones. converged: whether the next step promises too little to be worth taking.
-    """
+    """A state with its residuals and equations. jitter: variance of the mirror's jitter. matrix, right: equations of
+    all shared parameters, (p, p) and (p,). condition: condition number of the free parameters' equations. converged:
+    whether the next step promises too little to be worth taking."""
 
     state: RigState
     rows: list[tuple[Rows, Rows]]

@@ -47,9 +47,8 @@ MOST_OFF = 4.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Pixels that several sweeps share: command and weight (0: none) (pixels, sweeps), rows (pixels,), and the
-    direction and speed of each sweep.
-    """
+    """Pixels that several sweeps share. command, weight: (pixels, sweeps); a weight of 0 means that there is no
+    passage. rows: (pixels,). direction, speed: (sweeps,)."""
 
     command: Array
     weight: Array
@@ -89,7 +88,7 @@ class SharedPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """The result of a least squares fit. value, covariance: of the unknowns, one for each design of `solve`.
+    """The result of a least squares fit. value, covariance: those of the unknowns, one for each design of `solve`.
 
     residual: (pixels, sweeps), in command units. weight: weight of each passage, 0 for an outlier. noise: robust sd of
     the residuals in units of the stated sd. design: (pixels, sweeps, designs), after elimination of each pixel's own
@@ -164,7 +163,8 @@ def clusters(seen: SharedPixels) -> NDArray[np.int64]:
 
 
 def clustered(values: Array, cluster: NDArray[np.int64]) -> Array:
-    """Sums (clusters, n) of values (pixels, sweeps, n)."""
+    """Sums (clusters, n) of values (pixels, sweeps, n) over each cluster. cluster: (pixels, sweeps), as from
+    `clusters`."""
     at = cluster.reshape(-1)
     return np.stack([np.bincount(at, values[:, :, a].reshape(-1)) for a in range(values.shape[2])], axis=1)
 
@@ -178,7 +178,7 @@ MOST_CHI2_SDS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SweepTiming:
-    """The lag of one sweep by itself: the fitted lag, changed by the sweep's mean residual. sd_s: of this change."""
+    """The lag of one sweep by itself: the fitted lag, changed by the sweep's mean residual. sd_s: sd of this change."""
 
     direction: int
     speed_per_s: float
@@ -199,8 +199,8 @@ class SyncFit:
     speed_range_per_s: the range in which they hold. common: whether the two lags could not be separated. told: the
     directions that were scanned, +1 and -1. row_told: whether the row delay was determined; if not, it is the one known
     before, with the variance that the sweeps alone would have given. sweeps: lag of each sweep by itself, at the fitted
-    row delay. chi2, dof: of these lags against the fitted ones; `steady`: whether they agree. noise: robust standard
-    deviation of the residuals in units of the stated sd.
+    row delay. chi2, dof: chi squared of these lags against the fitted ones, and its degrees of freedom; `steady`:
+    whether they agree. noise: robust standard deviation of the residuals in units of the stated sd.
     """
 
     lag_s: Lag

@@ -36,7 +36,8 @@ def bundled_scenes() -> tuple[Bundled, ...]:
 
 
 def short_names(scenes: Iterable[str]) -> dict[str, str]:
-    """Names of scenes for tables, by path: its last part, or all of it if another one ends in the same part."""
+    """Short names of scenes for tables, by the scenes' paths: the last part of the path, or the whole path if the last
+    part of another one is equal."""
     last = {scene: scene.rstrip("/").rsplit("/", 1)[-1] for scene in scenes}
     names = list(last.values())
     return {scene: name if names.count(name) == 1 else scene for scene, name in last.items()}

@@ -168,7 +168,8 @@ def bundled_configs() -> tuple[str, ...]:
 
 
 def find_config(name_or_path: str | Path) -> Path:
-    """Find the file that a bundled name or a path means. Raises UsageError if there is none."""
+    """Find the file that a bundled name or a path means. A file of that path goes before a bundled config of that name.
+    Raises UsageError if there is none."""
     path = Path(name_or_path)
     if os.path.isfile(path):  # unlike Path.is_file, it takes any text for a name
         return path

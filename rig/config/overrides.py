@@ -31,8 +31,8 @@ def configure(
     """Load and validate a config, changed by options. An option that is None leaves the config's value.
 
     config: the name of a bundled rig, a file or a RigConfig.
-    scene: for a simulated rig: the name of a bundled scene, or a path.
-    fog: replaces the scene's fog: a visibility such as '20 m', or 'clear'.
+    scene: the name of a bundled scene, or a path; only for a simulated rig.
+    fog: replaces the scene's fog: a visibility such as '20 m', or 'clear'; only for a simulated rig.
     exposures: frames per column.
     estimator, filter, min_confidence: as in the config's `estimate`.
     temporal_prior: make `joint` use the last map as a weak prior for the next.
@@ -69,7 +69,8 @@ def seed_problems(seed: int) -> list[str]:
 
 
 def with_settings(config: RigConfig, options: Mapping[str, object]) -> RigConfig:
-    """A config with other values for some keys, by dotted name: {"scan.exposures": 4}. Values are written as in a file.
+    """A config with other values for some keys, by 'SECTION.KEY': {"scan.exposures": 4}. Values are written as in a
+    file.
 
     Raises UsageError with one line per problem.
     """

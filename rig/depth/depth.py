@@ -53,7 +53,7 @@ def depth_map(
 ) -> DepthMap:
     """Depth of the pixels that two neighbouring stripes of one surface enclose, with its confidence and its error.
 
-    Only stripes of at least `min_confidence` are used. There is also no depth if 1/z is above 1.1 / near or below
+    Only stripes with at least `min_confidence` are used. There is also no depth if 1/z is above 1.1 / near or below
     0.9 / far, with near and far the limits of the depth range.
     """
     from rig.depth.kernels import depth_rows, fill_rows

@@ -1,4 +1,4 @@
-"""Points that float between two surfaces are left out of a depth map: the hem of things that stand before others.
+"""Finds points of a depth map that float between two surfaces: wrong points at the edges of near objects.
 
 Points are compared by disparity, in px along the row. A point floats if of the 9 x 9 points around it
 
@@ -6,9 +6,9 @@ Points are compared by disparity, in px along the row. A point floats if of the 
 - fewer than one in LEAST_SHARE lie on its own surface (within SAME_PX);
 - there are at least LEAST_POINTS, more than two rows or columns have.
 
-A straight wire one pixel wide leads out of the 9 x 9: one point in ten lies on it, around its end one in twenty. So
-wires, twigs and bars stay, also where some of their rows are missing, and so do planes of up to 2.5 px of disparity
-per pixel, 1.75 px at the border of the map. A map of one or two rows or columns has too few points to tell.
+A straight wire one pixel wide crosses the 9 x 9: one point in ten lies on it, and one in twenty at its end. So wires,
+twigs and bars stay, even where some of their rows are missing. So do planes of up to 2.5 px of disparity per pixel, or
+1.75 px at the border of the map. A map of one or two rows or columns has too few points to tell.
 """
 
 from typing import Final

@@ -53,7 +53,10 @@ FLUX_MAX: Final = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FogFit:
-    """haze, extinction, offset and rest, (4,), and their covariance (4, 4); haze is that at the mean path `at_m`."""
+    """The fitted light of a map. value: haze, extinction in 1/m, offset and rest, (4,). covariance: (4, 4), of these.
+
+    at_m: the mean path in metres; the haze is that at this path.
+    """
 
     value: Float64
     covariance: Float64
@@ -61,10 +64,11 @@ class FogFit:
 
 
 def fit_fog(sums: Float64, path_m: Float64) -> FogFit | None:
-    """Fit of block sums (blocks, 2, bins, 4), or None if too little was seen before stripes. path_m: (bins,).
+    """Fit block sums (blocks, 2, bins, 4); None if too little was seen before stripes. path_m: (bins,), the path of
+    each.
 
-    Levenberg's steps start from the likeliest of several extinctions. The covariance is that of the counts; each
-    parameter's error is widened to the sandwich's if that is larger.
+    Newton's steps, damped as by Levenberg, start from the likeliest of several extinctions. The covariance is that of
+    the counts; each parameter's error is widened to the sandwich's if that is larger.
     """
     blocks, _, bins, _ = sums.shape
     used = sums[..., 1].sum(0).ravel() > LEAST_EXPOSURES
@@ -177,8 +181,9 @@ the decay is flatter by 25 to 40 % if `rest` is 0.35 to 0.45 (Mitsuba rows, docs
 
 @dataclass(frozen=True, slots=True)
 class FogEstimate:
-    """Fog and light of a map, each but veil_to_signal with its standard deviation; None if it is not resolved.
+    """Fog and light of a map. A quantity that is not resolved is None.
 
+    Names with `sd` are standard deviations; veil_to_signal has none.
     visibility_m: 3.912 / extinction. visibility_sd_m: half of the amount by which visibility grows if the extinction
     is smaller by two of its standard deviations.
     ambient_per_exposure: photons per pixel and exposure that are not the laser's (ambient light from surfaces and fog,
@@ -208,8 +213,10 @@ def read_fog(
 ) -> FogEstimate:
     """The fog of one map; all None if fewer than LEAST_LINES rows are clear, or if they show too little.
 
+    With a halo or several lines, only ambient light is given, and only if there are dark frames.
     sweep: a `CountVolume`, or a sweep with `lines` of counts. stripe: its stripe table, made with the `RowModel`
-    `state`. where: lines of counts that are read of a `CountVolume`; None for those of `next_lattice`.
+    `state`. where: rows and columns of the lines of counts that are read from a `CountVolume`; None for
+    `next_lattice`'s.
     """
     from rig.depth.kernels import SUMS, add_clear_rows
     from rig.estimate.row.em import lines_of, next_lattice

@@ -10,9 +10,9 @@ from one pixel to the next. So with the standard deviations of both stripes
 
     sd of inverse depth = s ((1 - f) sd_a + f sd_b)
 
-if the errors of neighbouring stripes are the same. With `joint` they nearly are, so the depths are as exact as stated
-if the stripes are. If the errors are independent of each other, the standard deviation is smaller, down to 0.7 times
-this.
+if the errors of neighbouring stripes are equal. With the estimator `joint` they nearly are, so the stated error of the
+depth is right if that of the stripes is. If the errors are independent of each other, the standard deviation is
+smaller, down to 0.7 times this.
 `depth_rows` turns inverse depth w into depth 1 / w, whose standard deviation is that of w over w^2.
 `add_clear_rows` adds up counts, exposures and light (see `SUMS`) of pixels clearly before and clearly behind the
 stripes of a sweep.
@@ -39,8 +39,8 @@ def fill_rows(
     x_px: Float32, confidence: Float32, x_sd_px: Float32, min_confidence: float, plane: Float64, u: Float32, v: Float32,
     inverse_depth: Float32, depth_confidence: Float32, inverse_depth_sd: Float32, commands: Float64, command: Float64,
 ) -> None:  # fmt: skip
-    """Write inverse depth, its confidence and its standard deviation (rows, width) for pixels between stripes of
-    neighbouring columns. Other pixels keep what the arrays hold; confidence must begin below 0.
+    """Write inverse depth in 1/m, its confidence and its standard deviation (rows, width) for pixels between stripes of
+    neighbouring columns. Other pixels keep what the arrays hold; `depth_confidence` must begin below 0.
 
     Also writes the mirror's command there, from the columns' `commands`, unless `command` is empty.
 
@@ -94,8 +94,8 @@ def depth_rows(
     inverse_depth: Float32, lowest: np.float32, highest: np.float32, depth_m: Float32, confidence: Float32,
     sd_m: Float32,
 ) -> None:  # fmt: skip
-    """Write depth (rows, width) in metres of inverse depths from `lowest` to `highest`; elsewhere NaN, with confidence
-    0. sd_m: holds the standard deviation of inverse depth, and becomes that of depth."""
+    """Write the depth (rows, width) in metres for inverse depths in 1/m from `lowest` to `highest`; elsewhere NaN, with
+    confidence 0. sd_m: holds the standard deviation of inverse depth, and becomes that of depth."""
     for y in range(inverse_depth.shape[0]):
         for x in range(inverse_depth.shape[1]):
             w = inverse_depth[y, x]
@@ -121,10 +121,11 @@ def add_clear_rows(
 ) -> None:  # fmt: skip
     """Add the pixels that are clear_px or more before or behind the stripe at x_px, for each clear row of a column.
 
-    lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether its stripe is
-    beyond doubt; other rows are skipped. block: in which block of rows and columns it lies. sums: (blocks, 2, bins,
-    SUMS), before and behind the stripe. at_stripe (lines, 2): path in metres and geometry factor of the haze at the
-    stripe, unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left out.
+    lines: the rows with their columns; x_px, clear and block have one entry for each. clear: whether the row's stripe
+    is beyond doubt; other rows are skipped. block: number of the block of rows and columns that the row belongs to.
+    sums: (blocks, 2, bins, SUMS), before and behind the stripe. at_stripe (lines, 2): path in metres and geometry
+    factor of the haze at the stripe, unchanged for skipped rows. Pixels with more ambient flux than hot_flux are left
+    out.
     """
     row = row_buffers(sweep.window, state.amplitude.shape[0])
     step = 1 if sweep.near_is_left else -1
@@ -153,10 +154,10 @@ def add_clear_rows(
 def sum_dark(
     dark_counts: NDArray[np.uint32], dark_frames: Int32, ambient: Float32, hot_flux: float
 ) -> tuple[float, float, float]:
-    """Ones, exposures, and exposures weighted with the ambient flux (rows, width), all over dark frames.
+    """Sums over all dark frames: ones (detections), exposures, and exposures weighted with the flux `ambient`.
 
-    dark_counts: (rows, width); dark_frames: (width,), number of dark frames in which a pixel was used. Pixels with more
-    ambient flux than hot_flux are left out.
+    ambient, dark_counts: (rows, width); dark_frames: (width,), number of dark frames in which a pixel was used. Pixels
+    with more ambient flux than hot_flux are left out.
     """
     ones, exposures, light = 0.0, 0.0, 0.0
     for y in range(ambient.shape[0]):

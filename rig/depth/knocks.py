@@ -1,10 +1,9 @@
-"""Whether camera, lens or mirror moved between two maps: then all stripes of a column move by the same distance.
+"""Tells whether camera, lens or mirror moved between two maps: then all stripes of a column move by the same distance.
 
-A scene that moves, or a rig that moves before it, shifts stripes in proportion to a change of inverse depth, so near
-and far ones by different distances. A lens that was knocked shifts both alike, and every depth measured since is wrong.
-The first and the last third of the columns are compared with the map before, each for itself, since a knock may come
-in the middle of a sweep. Nothing is said where fewer than FEWEST stripes are sure in both maps, nor of a scene that is
-too flat.
+A scene that moves, or a rig that moves before it, shifts stripes in proportion to a change of inverse depth: near ones
+farther than far ones. A lens that was knocked shifts both alike, and every depth measured since is wrong. The first and
+the last third of the columns are each compared with those of the map before, since a knock may come in the middle of a
+sweep. Nothing is said if fewer than FEWEST stripes of a third are sure in both maps, or if the scene is too flat.
 """
 
 from dataclasses import replace
@@ -40,14 +39,15 @@ KNOCKED: Final = (
 
 
 class KnockWatch:
-    """Compares the maps of a run, one after the other. geometry: of the maps; None without a calibration."""
+    """Compares the maps of a run, one after the other. geometry: that of the maps; None without a calibration, and
+    nothing is then compared."""
 
     def __init__(self, geometry: SweepGeometry | None) -> None:
         self._geometry = geometry
         self._before: StripeTable | None = None
 
     def checked(self, result: MapResult) -> MapResult:
-        """The next map, with a doubt more if all stripes have moved alike since the one before it."""
+        """The next map, with one more doubt if its stripes have all moved alike since the map before."""
         before, self._before = self._before, result.stripe
         if before is None or self._geometry is None or not knocked(before, result.stripe, self._geometry):
             return result
@@ -55,7 +55,8 @@ class KnockWatch:
 
 
 def knocked(before: StripeTable, after: StripeTable, geometry: SweepGeometry) -> bool:
-    """Whether all stripes of a map, or of a third of it, have moved alike since the map before it."""
+    """Whether the stripes of the first or the last third of the columns have moved alike, near and far ones, since the
+    map before. False if too few are sure, or the scene is too flat to tell."""
     columns = geometry.columns
     parts = slice(0, columns // 3), slice(columns - columns // 3, columns)
     return any(_moved_px(before, after, geometry, part) is not None for part in parts)

@@ -18,7 +18,7 @@ from rig.shared_time import SharedTime
 
 
 class Counted(Protocol):
-    """A counted sweep. tally: of the maker's counter."""
+    """A counted sweep. tally: what the maker's counter gave for it."""
 
     @property
     def tally(self) -> FrameTally:
@@ -63,8 +63,9 @@ class MapsAtOnce(Generic[AnyCounted]):
     def put(self, sweep: AnyCounted, *, last: bool) -> None:
         """Begin the map of a sweep, or make and deliver it if no other map may be made at the same time.
 
-        Waits first for earlier maps if this one needs what is learned from them, or if all threads are at work. last:
-        whether no other sweep follows soon. Raises what making a map raises, of this sweep or of an earlier one.
+        Earlier maps that are ready are delivered first. Waits for earlier maps, and delivers them, if this one needs
+        what is learned from them, or if all threads are at work. last: whether no other sweep follows soon. Raises what
+        making a map raises, of this sweep or of an earlier one.
         """
         self.deliver_ready()
         maker, pool = self._maker, self._pool
@@ -85,20 +86,21 @@ class MapsAtOnce(Generic[AnyCounted]):
         self._deliver(sweep, result)
 
     def deliver_ready(self) -> bool:
-        """Deliver the maps that are ready; returns whether others are under way."""
+        """Deliver the maps that are ready; returns whether others are under way. Raises what making a map raised."""
         while self._maps and self._maps[0].result.done():
             self._deliver_next()
         return bool(self._maps)
 
     def deliver_next(self) -> bool:
-        """Wait for the next map and deliver it; returns whether others are under way afterwards. After a map that
-        failed, none is delivered any more."""
+        """Wait for the next map and deliver it; returns whether others are under way afterwards. Raises what making the
+        map raised. After a map that failed, none is delivered any more."""
         if self._maps and not self._failed:
             self._deliver_next()
         return bool(self._maps) and not self._failed
 
     def close(self) -> None:
-        """Let go of everything that maps are made with; none can be made afterwards."""
+        """Let go of everything that maps are made with, without waiting for maps under way; none can be made
+        afterwards."""
         if self._pool is not None:
             self._pool.shutdown(wait=False)
         self._free.clear()

@@ -45,11 +45,12 @@ class Plane:
 
 
 def fit_plane(points_m: Float64, seed: int = 0) -> Plane | None:
-    """Fit a plane to points (n, 3) in metres by orthogonal least squares, without outliers.
+    """Fit a plane to points (n, 3) in metres by orthogonal least squares, without outliers. Points that are not finite
+    are left out.
 
     None for fewer than `LEAST_POINTS` points, and for points that lie on a line. The start is the best of many planes
-    through three points, chosen by `seed` (least median of distances); then the outliers are left out and the rest is
-    fitted, until these are the same twice.
+    through three points, chosen by `seed` (least median of distances). Then outliers are left out and the rest is
+    fitted, again and again until the outliers stay the same.
     """
     points = np.asarray(points_m, np.float64)
     points = points[np.isfinite(points).all(axis=1)]
@@ -111,14 +112,14 @@ def _least_squares(points: Float64) -> tuple[Float64, float] | None:
 class RegionQuality:
     """Quality of the depth of one region of the camera's pixels, over maps. None: there is no such value.
 
-    pixels: of the region. maps: looked at. fill_rate: share of pixels with depth, mean over the maps; fill_rate_least:
-    of the worst map. depth_m: median of all depths.
+    pixels: number of the region's pixels. maps: number of maps. fill_rate: share of pixels with depth, mean over the
+    maps; fill_rate_least: that of the worst map. depth_m: median over the maps of each map's median depth.
     plane_rms_m: root mean square distance from the plane fitted to each map, over the maps; plane_outliers: share of
-    the points left out of it. planes: maps to which a plane could be fitted. plane_distance_m: of the plane from the
-    camera, mean over the maps; plane_distance_sd_m: its standard deviation. tilt_deg: between the plane's normal
-    and the camera's axis.
+    the points left out of it. planes: number of maps to which a plane could be fitted. plane_distance_m: distance of
+    the plane from the camera, mean over the maps; plane_distance_sd_m: its standard deviation. tilt_deg: angle between
+    the planes' mean normal and the camera's axis.
     temporal_sd_m: median over the pixels of each one's standard deviation over the maps; temporal_rms_m: root of the
-    mean variance. repeated_pixels: those with a depth in at least two maps.
+    mean variance. repeated_pixels: number of pixels with a depth in at least two maps.
     """
 
     pixels: int
@@ -150,7 +151,8 @@ class RegionTally:
         self._planes: list[Plane] = []
 
     def add(self, depth_m: Float32 | Float64, points_m: Float64) -> None:
-        """Add a map: depth (rows, width), NaN where there is none, and the points (n, 3) of the pixels with depth."""
+        """Add a map: depth in metres (rows, width), NaN where there is none, and the points (n, 3) of the pixels with
+        depth. Raises ValueError for a depth of another shape."""
         depth = np.asarray(depth_m, np.float64)
         if depth.shape != self._shape:
             raise ValueError(f"depth of {depth.shape} pixels, the region has {self._shape}")

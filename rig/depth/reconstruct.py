@@ -32,10 +32,10 @@ class MapResult:
 
     depth_m, confidence, depth_sd_m: float32 (rows, width), as in `rig.depth.depth.DepthMap`: NaN, 0 and NaN where there
     is no depth, which is everywhere without a calibration.
-    compute_s: seconds that estimating and making it took. learned: the state that the estimator used, None if it learns
-    nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`) and frames
-    (`rig.count.sweep_watch`). floating: number of points left out because they float between two surfaces; None if such
-    points are kept, or without depth.
+    compute_s: seconds that estimating and making the map took. learned: the state that the estimator used, None if it
+    learns nothing. doubts: sentences on why the map may be wrong, judged by its own light (`rig.count.map_checks`) and
+    frames (`rig.count.sweep_watch`). floating: number of points left out because they float between two surfaces; None
+    if such points are kept, or without depth.
     """
 
     stripe: StripeTable
@@ -69,7 +69,8 @@ def map_geometry(
 
 
 class MapUnderWay(NamedTuple):
-    """A map that was begun. run: makes it, on any thread. end: learns from it, in the order of the sweeps."""
+    """A map that was begun. run: makes the map, on any thread. end: makes the estimator learn from it; called in the
+    order of the sweeps."""
 
     run: Callable[[], MapResult]
     end: Callable[[], None]
@@ -97,10 +98,10 @@ class MakesMaps(Protocol):
 class Reconstructor:
     """Turns counted sweeps into maps; estimators that learn carry their state from map to map.
 
-    model, column_commands, lines: the same that were given to `map_geometry`. learned: kept states; each map is then
-    estimated with its own, and nothing is learned. kept: the state of an earlier run, used by `joint` if it explains
-    the first map. Raises KeyError for the estimator `auto` (`rig.scan.estimator` chooses one first), and with `learned`
-    for estimators that learn nothing.
+    model, column_commands, lines: the same that were given to `map_geometry`. learned: states kept of earlier maps, one
+    for each map to come; each map is then estimated with its own state, and nothing is learned. kept: the state of an
+    earlier run, used by `joint` if it explains the first map. Raises KeyError for the estimator `auto`
+    (`rig.scan.estimator` chooses one first), and with `learned` for estimators that learn nothing.
     """
 
     def __init__(
@@ -151,9 +152,10 @@ class Reconstructor:
         return self.estimator.counter(layout, self.geometry)
 
     def map(self, sweep: FrameTally) -> MapResult:
-        """Make the map of one counted sweep; its `compute_s` is the time for all of this.
+        """Make the map of one counted sweep; its `compute_s` covers the estimate and all that follows it.
 
-        sweep: the result of a `counter`, or a `CountVolume`.
+        sweep: the result of a `counter`, or a `CountVolume`. Raises UsageError if an estimator of another package gives
+        a stripe table that is not valid.
         """
         begun = time.perf_counter()
         try:
@@ -172,7 +174,8 @@ class Reconstructor:
         return [Lane(self.estimator.solver(), RowWorkers(1)) for _ in range(n)] if n > 1 else []
 
     def may_begin(self, frames: int) -> bool:
-        """Whether the next map may be begun while maps with so many lit frames are under way."""
+        """Whether the next map may be begun while maps with `frames` lit frames in total are under way. Only with
+        `lanes`."""
         assert isinstance(self.estimator, ManyMaps), "it has lanes"
         return self.estimator.may_begin(frames)
 
@@ -199,7 +202,8 @@ class Reconstructor:
         self, stripe: StripeTable, sweep: FrameTally, filter: str, estimate_s: float, used: Learned | None,
         workers: RowWorkers,
     ) -> MapResult:  # fmt: skip
-        """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread."""
+        """Do the work of `complete` for a stripe table estimated with the state `used`; on any thread. Raises
+        UsageError as `map` does."""
         begun = time.perf_counter() - estimate_s
         geometry = self._bound(sweep)
         if self._name not in ESTIMATORS and (problem := stripe.problem(geometry.rows, geometry.columns)):

@@ -24,8 +24,8 @@ MAPS = 2
 
 @cache
 def warm_up(estimator: str, filter: str, exposures: int, *, dark: bool) -> None:
-    """Estimate two small synthetic maps with this number of exposures, and throw them away. Does nothing the second
-    time: then the program has what was compiled.
+    """Estimate two small synthetic maps with this number of exposures, and throw them away. Does nothing when called
+    again with the same arguments, since the program then has what was compiled.
 
     dark: whether the run will have dark frames. numba keeps compiled code on disk, so only the first run ever waits.
     """

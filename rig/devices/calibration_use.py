@@ -95,7 +95,8 @@ class CalibrationUse:
 def identity_of(rig: OpenRig) -> Identity:
     """Identity of an open rig, with the present date.
 
-    A rig that plays a recording has identity and date of the recorded rig. Then raises what `recorded_identity` does.
+    A rig that plays a recording has the identity and the date of the recorded rig; what `recorded_identity` raises is
+    then raised here too.
     """
     if isinstance(rig.spad, ReplaySpad):
         return recorded_identity(rig.spad.recording.path)
@@ -124,7 +125,7 @@ def recorded_identity(run: Path) -> Identity:
 
 
 def same_rig(one: Identity, other: Identity) -> bool:
-    """Whether views with these two identities are of one rig."""
+    """Whether two identities are of one rig: whether their kinds and serial numbers are equal."""
     kinds, others = _comparable(one, other)
     return kinds == others and one.serials == other.serials
 
@@ -305,7 +306,7 @@ def accepted_by(use: CalibrationUse | None) -> tuple[str, ...]:
 
 
 def failed_verdict(verdict: str | None, reasons: Sequence[str]) -> list[Refusal]:
-    """The reason that follows from a calibration's own verdict; none if it passed or was not judged (None)."""
+    """The reason that follows from a calibration's own verdict; empty if it passed or was not judged (None)."""
     if verdict != "failed":
         return []
     why = ", ".join(reasons) or "no reason noted"
@@ -319,7 +320,8 @@ def require_accepted(name: str, found: Sequence[Refusal], accepted: Container[st
 
 
 def check_content(checked: str, accepted: Sequence[Refusal]) -> dict[str, Any]:
-    """The outcome of the comparison for a manifest: the word `checked`, or 'accepted' and the reasons, if any."""
+    """The outcome of the comparison for a manifest: 'accepted' with the accepted reasons, or the word `checked` without
+    any."""
     if not accepted:
         return {"check": checked}
     return {"check": "accepted", "accepted": [[each.code, each.text] for each in accepted]}
@@ -349,7 +351,7 @@ def try_note(file: Path, model: RigModel, what: str, *, passed: bool, reasons: t
 def carry_notes(old: Path, before: RigModel, new: Path, after: RigModel, *, new_pixels: bool = False) -> None:
     """Copy the notes on failed checks from a calibration to the one made from it. Raises what `note_check` raises.
 
-    new_pixels: whether the new one has a pixel map of its own, so that notes on the old one do not apply.
+    new_pixels: whether the new one has a pixel map of its own, to which notes on the old pixel map do not apply.
     """
     failed = {what: note for what, note in notes_on(old, before).items() if not note.get("passed", True)}
     if new_pixels:

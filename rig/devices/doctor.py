@@ -72,9 +72,10 @@ class LineMarkers:
 class DarkLook:
     """Frames of a sweep with the gate low, and what came with them.
 
-    records: (n,), records of all frames. dark_share: share of pixels that fired, in the first frame of each block.
-    n_bytes: bytes of all frames' pixels. seconds: from the start of the mirror until all frames had come. counters: the
-    SPAD's own, read before it was stopped. triggered: whether the sync source's program ran to its end.
+    records: (n,), one for each frame. dark_share: share of pixels that fired, in the first frame of each block.
+    n_bytes: bytes of all frames' pixels. seconds: time from the start of the mirror until all frames had come.
+    counters: those of the SPAD, read before it was stopped. triggered: whether the sync source's program ran to its
+    end.
     """
 
     records: NDArray[np.void]
@@ -103,7 +104,10 @@ class DarkLook:
 
 
 def look(rig: OpenRig, plan: ScanPlan, stride: int) -> DarkLook:
-    """Run the scanner for a sweep with the gate low. Raises DeviceError. stride: bytes of the SPAD's largest block."""
+    """Run the scanner for a sweep with the gate low, then stop SPAD, scanner and sync source. Raises DeviceError.
+
+    stride: bytes of the SPAD's largest block.
+    """
     rig.scanner.load(plan.waveform, plan.scanner_repeats(1))
     rig.sync.program(DARK_PROGRAM, 1)
     if rig.guard is not None:  # frames may come late here: nothing can shine
@@ -151,7 +155,10 @@ class Finding:
 
 
 def examine(config: RigConfig, folder: Path) -> list[Finding]:
-    """Examine everything. folder: where a scan would write. Faults of config and devices are findings, not errors."""
+    """Open the devices and examine them, the calibration, the frames of a dark sweep and the disk. The mirror moves.
+
+    folder: where a scan would write. Faults of config and devices are findings, not errors.
+    """
     findings: list[Finding] = []
     try:
         with open_rig(config) as rig:
@@ -301,7 +308,8 @@ KNOWN = (("helios", HELIOS), ("lasercube", LASERCUBE), *(("spb-usb", one) for on
 class Attached:
     """One attached device.
 
-    address: the value of a config's `port` for it. kind: kind of its driver; None for a serial port of any kind.
+    address: the value of a config's `port` for it. what: description for people. kind: kind of its driver; None for a
+    serial port of any kind.
     """
 
     address: str
@@ -333,8 +341,8 @@ def attached() -> list[Attached]:
 def laser_off(config: RigConfig) -> list[str]:
     """Set the gate low and switch emission off; returns what was done.
 
-    Both are tried even if one fails. Raises DevicesError with the failures, then with what was done. That a laser can
-    only be switched off by hand counts as a failure.
+    Both are tried even if one fails. Raises DevicesError, whose message names the failures first and then what was
+    done. A laser that can only be switched off by hand counts as a failure. Also raises what `open_light` raises.
     """
     done: list[str] = []
     trouble: list[str] = []

@@ -77,7 +77,7 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
     """Open every device of the config; on exit the sync source is closed first, then laser, scanner and SPAD.
 
     A simulated rig has virtual time; a real one, or a simulated one that works in real time, has the host's.
-    seed: of everything simulated.
+    seed: the seed of everything simulated.
     tap: file that records what passes the ports of all devices; for the SPAD, only its control traffic.
     Raises UsageError for faults of config or calibration, DevicesError for faults of devices; each lists all problems.
     Raises DeviceError for a laser or gate that must be guarded, where no guard can run.
@@ -90,10 +90,12 @@ def open_rig(config: RigConfig, seed: int = 0, tap: TapFile | None = None) -> It
 
 @contextmanager
 def open_light(config: RigConfig, trouble: list[str]) -> Iterator[tuple[SyncSource | None, LineLaser | None]]:
-    """Open only the gate and the laser, without a guard. One that fails is None and adds a line to `trouble`. If its
-    kind has bytes that switch it off, these are sent all the same: it may receive what it does not answer.
+    """A context with only the gate and the laser open, without a guard. A device that fails is None and adds a line to
+    `trouble`. If it fails by not answering, and its kind has bytes that switch it off, these are sent all the same: it
+    may still receive.
 
-    Raises DeviceError if the world, if there is one, cannot be made."""
+    Raises DeviceError if the config has a simulated world and this cannot be made.
+    """
     with ExitStack() as stack:
         surroundings = surroundings_of(config, 0, stack)
         opened: dict[str, Any] = {"sync": None, "laser": None}
@@ -121,9 +123,8 @@ def _told_off(slot: str, config: KindConfig, surroundings: Surroundings) -> str:
 
 
 def check_files(config: RigConfig) -> None:
-    """Check every file that a config names, as `open_rig` would, but open no device. Raises UsageError with a line per
-    problem.
-    """
+    """Check every file that a config names, as `open_rig` would, but open no device. Raises UsageError with a line for
+    each problem."""
     problems: list[str] = []
     _load_model(config, problems)
     with ExitStack() as stack:
@@ -184,7 +185,10 @@ def _create_surroundings(config: RigConfig, seed: int, stack: ExitStack, problem
 
 
 def surroundings_of(config: RigConfig, seed: int, stack: ExitStack) -> Surroundings:
-    """Clock, world and the ports of devices that it emulates. Raises DeviceError if the world cannot be made."""
+    """Clock, world and the ports of devices that the world emulates. Raises DeviceError if the world cannot be made.
+
+    stack: unplugs the emulated devices when it is closed.
+    """
     virtual = config.world is not None and not config.world.real_time
     clock = VirtualClock() if virtual else SystemClock()
     bare = Surroundings(clock, None, seed)

@@ -44,8 +44,11 @@ class PlansEffects(Protocol):
 
 
 def prepare(rig: OpenRig) -> tuple[ScanPlan, SpadTiming]:
-    """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves. Raises PlanError for a scan
-    that these devices cannot do, DeviceError if the SPAD refuses it; for a recording what `replay_plan` raises."""
+    """Compile the plan and configure the SPAD for it. Nothing moves and no light leaves.
+
+    Raises PlanError for a scan that these devices cannot do, and DeviceError if the SPAD refuses it. For a recording it
+    raises what `replay_plan` raises.
+    """
     scan = rig.config.scan
     if isinstance(rig.spad, ReplaySpad):  # a recording is bound by the plan that it was taken with
         return replay_plan(rig.spad, rig.spad.recording, scan, rig.model)
@@ -96,12 +99,14 @@ They are added if the memory has room and the SPAD has markers: reading then end
 
 
 def lead_s(rig: OpenRig) -> float:
-    """Seconds between the SPAD's start and the first scan marker, whose frames a burst must have room for."""
+    """Seconds between the SPAD's start and the first scan marker; a burst must have room for the frames of this
+    time."""
     return BURST_LEAD_S if isinstance(rig.clock, VirtualClock) else HOST_LEAD_S
 
 
 def spare_lead_s(rig: OpenRig) -> float:
-    """Further seconds before the first scan marker for which a burst gets room if its memory is large enough."""
+    """Further seconds before the first scan marker for which a burst gets room if its memory is large enough; 0 in
+    virtual time and for a SPAD without markers."""
     return 0.0 if isinstance(rig.clock, VirtualClock) or not rig.spad.info.markers else SPARE_LEAD_S
 
 

@@ -23,8 +23,8 @@ class ForeignFrames:
 
     chunks: returns the frames in pieces, uint8 (any number, height, ceil(width / 8)), most significant bit = leftmost
     pixel.
-    origin: facts for the manifest. frame_rate: in Hz; None if unknown. ranges: (first, number of frames) of each
-    stretch without a gap; empty if unknown. hints: lines for the user about what may be wrong.
+    origin: facts for the manifest. frame_rate: Hz; None if unknown. ranges: (first, number of frames) of each stretch
+    without a gap; empty if unknown. hints: lines for the user about what may be wrong.
     """
 
     width: int

@@ -51,8 +51,10 @@ def require_h5py() -> Any:
 
 
 def write_hdf5(blocks: Iterable[FrameBlock], maps: MapFiles, manifest: Mapping[str, Any], path: Path) -> FrameLog:
-    """Write frames, maps and manifest to a new file. A run without frames or without maps has no such group. Raises
-    UsageError without h5py or if the frames do not make one array, OSError if the disk has too little room left."""
+    """Write frames, maps and manifest to a new file. Without frames or maps, their group is left out.
+
+    Raises UsageError without h5py or if the frames do not make one array, OSError if the disk has too little room left.
+    """
     h5py = require_h5py()
     log = FrameLog()
     with h5py.File(path, "w", userblock_size=_USER_BLOCK) as file:

@@ -1,8 +1,8 @@
 """`rig import`: makes a recording from the frames of another program.
 
 Foreign files contain pixels and little else. What they do not say is left open in the recording: there are no markers,
-and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). The pixels are those of the files, if
-need be turned upright.
+and without a frame rate no clock (`frame_period_ticks` 0, one tick per frame). The pixels are those of the files,
+turned upright where necessary.
 """
 
 import shutil

@@ -30,7 +30,8 @@ _POSE: Final = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 
 
 class FrameLog:
-    """The records of all frames in order. Raises UsageError if a block has another size or clock than the first one."""
+    """The records of all frames, in the order in which their blocks are added. All blocks have the size and the clock
+    of the first one."""
 
     def __init__(self) -> None:
         self._header: BlockHeader | None = None
@@ -39,7 +40,7 @@ class FrameLog:
         self.n_frames = 0
 
     def add(self, block: FrameBlock) -> None:
-        """Add a block's records."""
+        """Add a block's records. Raises UsageError if its size or clock differs from the first block's."""
         header = block.header
         first = self._header = self._header or header
         if (header.width, header.height) != (first.width, first.height):
@@ -63,7 +64,8 @@ class FrameLog:
         return self._header
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Arrays (frames,): number, run id, ticks and time_s of the SPAD's clock, and other fields of the records."""
+        """Arrays (frames,) by name: number, run (its id), ticks and time_s of the SPAD's clock, and marks, x0, y0, line
+        and sweep of the records."""
         runs, *arrays = zip(*self._parts, strict=True)
         number, ticks, records = map(np.concatenate, arrays)
         return {
@@ -75,7 +77,7 @@ class FrameLog:
         }
 
     def ranges(self) -> Ranges:
-        """The stretches without a gap, in order."""
+        """(run id, first frame, number of frames) of each stretch without a gap, in order."""
         ranges: Ranges = []
         for run, numbers, *_ in self._parts:
             if len(numbers) == 0:
@@ -88,7 +90,7 @@ class FrameLog:
         return ranges
 
     def gaps(self) -> Ranges:
-        """The gaps between frames of one start."""
+        """(run id, first, last) of the frames missing between those of one start."""
         return [
             (run, first + n, next_first - 1)
             for (run, first, n), (next_run, next_first, _) in pairwise(self.ranges())
@@ -187,14 +189,15 @@ class MapFiles:
         return sorted(self._run.glob(f"{folder}/*{suffix}"))
 
     def arrays(self, index: int) -> dict[str, NDArray[np.float32]]:
-        """Stripe table of a map, (rows, columns) each, and depth_m (height, width) if the rig is calibrated."""
+        """Stripe table of a map, (rows, columns) each, and depth_m (height, width) if the rig is calibrated. Raises
+        UsageError if a file cannot be read."""
         arrays = load(self._run / "stripe" / f"{index:06d}.npz", read_stripe)
         file = self._run / "depth" / f"{index:06d}.npy"
         return {**arrays, "depth_m": load(file, read_depth)} if file.exists() else arrays
 
 
 def load(file: Path, read: Callable[[Path], Any]) -> Any:
-    """Load a file of numpy's. Raises UsageError, with one line, if that fails."""
+    """Read a numpy file with `read`. Raises UsageError, with one line, if that fails."""
     try:
         return read(file)
     except (OSError, ValueError) as error:

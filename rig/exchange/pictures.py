@@ -66,7 +66,7 @@ def frame_pictures(blocks: Iterable[FrameBlock], frames_per_picture: int) -> Ite
     """Sum received frames in groups, and draw the square roots of the sums as grey levels, for the whole sensor.
 
     An incomplete last group is left out. The brightest pixels of the first picture set the level of white for all, so
-    that a film does not flicker.
+    that a film does not flicker. Raises UsageError if a block names a sensor too large for a picture.
     """
     white = 0.0
     for counts in _sums(blocks, frames_per_picture):
@@ -83,8 +83,8 @@ def write_pngs(pictures: Iterable[Picture], folder: RunFolder, name: str) -> int
 
 
 def write_mp4(pictures: Iterable[Picture], path: Path, pictures_per_s: float) -> int:
-    """Write a film (MPEG-4 part 2); returns its number of pictures. Raises UsageError if this OpenCV writes no films or
-    only a part of the film was written."""
+    """Write a film (MPEG-4 part 2); returns its number of pictures. Without pictures no file is written. Raises
+    UsageError if this OpenCV writes no films or only a part of the film was written."""
     import cv2
 
     film = None

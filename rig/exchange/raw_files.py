@@ -2,7 +2,8 @@
 
 SPAD512S (Pi Imaging): 1-bit RAW files, dumps of the TCP stream, sparse lists. Packed files have rows of 64 bytes, most
 significant bit first. A dump of the stream may end with `DONE`; as pixels may have the same bytes, the length decides.
-Sparse lists are u32 little-endian numbers of the pixels that fired, counted row by row; rows x 512 ends a frame.
+Sparse lists are u32 little-endian numbers of the pixels that fired, counted row by row; the number rows x 512 ends a
+frame.
 
 SwissSPAD2: least significant bit first. Half array: 256 rows of 512 pixels, 512 frames in the camera's files of 8 MiB.
 Full array: 512 x 512, 256 frames a file, read out as 256 rows of 1024 pixels in 8 zones of 128: a quarter of the upper
@@ -43,7 +44,8 @@ _JUDGED_SIGMAS: Final = 10.0
 def open_pi_imaging(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
     """Open files as one sequence of frames. The form of each file is recognised unless the request states it.
 
-    Raises UsageError, a line per file, if it cannot be read, holds no whole number of frames, or could have both forms.
+    Raises UsageError with a line for each file that cannot be read, holds no whole number of frames, or could have both
+    forms.
     """
     form, rows = asked.form, asked.rows or ROWS
     opened = each_or_problems(files, lambda file: _open_pi_imaging(file, form, rows))
@@ -112,9 +114,8 @@ def _sparse(content: NDArray[np.uint8], rows: int) -> Iterator[NDArray[np.uint8]
 
 
 def open_swissspad2(files: Sequence[Path], asked: ImportRequest) -> ForeignFrames:
-    """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError, a line per
-    file, if it cannot be read or holds no whole number of frames.
-    """
+    """Open files as one sequence of frames, of half arrays unless the request says full. Raises UsageError with a line
+    for each file that cannot be read or holds no whole number of frames."""
     full = asked.form == "full"
     frame_bytes = _HALF_BYTES * (2 if full else 1)
 

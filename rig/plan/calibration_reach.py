@@ -1,7 +1,7 @@
 """Checks whether a calibration is valid for a scan: for its sensor, its mirror's speed and its range of commands.
 
-`recalibrated` adapts the plan of a recording to a calibration made later. Mirror and gate did what they did; lag and
-windows may change.
+`recalibrated` adapts the plan of a recording to a calibration made later. What mirror and gate did stays as it was; lag
+and windows may change.
 """
 
 import math
@@ -69,8 +69,8 @@ def whole_rows(plan: ScanPlan) -> ScanPlan:
 def recalibrated(plan: ScanPlan, model: RigModel) -> ScanPlan:
     """The plan with the lag and the windows of `model`; an equal plan if it was compiled for that model.
 
-    Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. Frames that do not contain a
-    column's window do not count for that column. Raises UsageError if the calibration does not fit the plan's sensor,
+    Mirror, gate and markers stay as they were, and so do the pixels that the SPAD sent. A frame that lacks pixels of a
+    column's window does not count for that column. Raises UsageError if the calibration does not fit the plan's sensor,
     speed, commands or depth range.
     """
     try:

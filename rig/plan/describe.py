@@ -85,7 +85,8 @@ _OF_LEG = ("direction", "lag_s", "gate_open_s", "gate_close_s")
 
 
 def plan_content(plan: ScanPlan) -> dict[str, Any]:
-    """The plan as plain values for the manifest and for programs."""
+    """The plan by names, for the manifest and for programs. Exact rates and times are Fractions, which `json_text`
+    writes as numbers."""
     return {
         **{name: getattr(plan, name) for name in _TIMING},
         "window_px": plan.window,

@@ -14,8 +14,8 @@ from rig.plan.scan_plan import ScanPlan
 def sync_program(plan: ScanPlan, maps: int) -> tuple[tuple[Pulse, ...], int]:
     """Pulses and repeats that open the gate once in each of `maps` sweeps and then leave it low.
 
-    A blanking pattern, if the plan has one, is given in each of these sweeps, in the sweep after them, and in pilot
-    sweeps before them, which have nothing else.
+    A blanking pattern, if the plan has one, is given in each of these sweeps. It is also given in pilot sweeps before
+    them and in one sweep after them, which have nothing else.
     """
     if plan.blanking is not None:
         lit = range(plan.pilots, plan.pilots + maps)
@@ -51,7 +51,8 @@ COMMANDS_TRIED = 256
 
 
 def unseen_pattern(plan: ScanPlan, model: RigModel | None) -> list[str]:
-    """Problems with a blanking pattern whose light the camera does not see within the depth range."""
+    """A problem for each direction of the mirror in which the camera does not see the blanking pattern's light within
+    the depth range. Empty without a pattern or a calibration."""
     if plan.blanking is None or model is None:
         return []
     u, _ = model.camera.tangents()

@@ -179,7 +179,7 @@ MOST_EXPOSURES = 65535
 class PathDemand:
     """The demand of a scan on the mirror.
 
-    edges: commands of the lit part's two ends. columns: of one line.
+    edges: commands of the lit part's two ends. columns: number of columns of one line.
     column_s, frame_s: exact seconds of a column and of a frame.
     lag_s: longest lag of the mirror.
     guard_s: extra time that the gate is open on either side. clock_tolerance: relative error of the gate's clock.
@@ -210,13 +210,14 @@ class PathDemand:
 
     @property
     def gate_margin_s(self) -> float:
-        """Time for which the gate is open beyond each end of the lit part: `guard_s`, and the drift of its clock."""
+        """Seconds that the gate is open beyond each end of the lit part: `guard_s` and the drift of the gate's
+        clock."""
         # The drift counts from the scan marker; the run-in is shorter than the lit part wherever it matters.
         return self.guard_s + self.clock_tolerance * 2 * float(self.lit_s)
 
     @property
     def cruise_margin_s(self) -> float:
-        """Time at constant velocity on either side of the lit part; the lag is then steady while the gate is open."""
+        """Seconds at constant velocity on either side of the lit part; the lag is steady while the gate is open."""
         return self.lag_s + self.gate_margin_s + self.lead_s
 
 
@@ -333,7 +334,8 @@ def remedy(demand: PathDemand, exposures: int, limits: ScannerLimits, point_cloc
 
 
 def narrowed(edges: tuple[float, float], share: float, limits: tuple[float, float]) -> tuple[float, float]:
-    """A share of the range of `edges` about its middle, moved inside the scanner's range if necessary."""
+    """The edges of a share of the range between `edges`, about its middle. They are moved into the scanner's range,
+    `limits`, if necessary."""
     half = (edges[1] - edges[0]) / 2 * share
     low, high = limits
     middle = min(max((edges[0] + edges[1]) / 2, low + abs(half)), max(high - abs(half), low + abs(half)))

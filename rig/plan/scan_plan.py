@@ -114,6 +114,7 @@ class ScanPlan:
     commands: float64 (columns,), mirror command of each column's centre, plus its line's offset.
     x0: int32 (columns,), first stored pixel of each column's window. window: the windows' width in stored pixels. Both
       are multiples of 64.
+    burst_frames, readout_bytes_per_s: capacity of the SPAD's memory and rate of its readout; None in the mode 'stream'.
     link_bytes_per_s: rate that the SPAD's link carries; None if it cannot stream.
     windows: which pixels of a frame are used, as a table by the markers before that frame; None if all are.
     windowed: whether the SPAD sends only these pixels.

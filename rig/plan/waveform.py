@@ -68,7 +68,7 @@ def _scan_marker_points(leg: Leg, rate: Fraction) -> int:
 
 
 def waveform_of(legs: tuple[Leg, ...], marker_points: NDArray[np.int64], rate: Fraction) -> ScanWaveform:
-    """Commands and markers of one repetition, point by point."""
+    """Commands and markers of one repetition (one sweep of each leg), point by point."""
     commands, words = [], []
     for leg in legs:
         commands.append(leg.path.command(np.arange(leg.path.points, dtype=np.float64)))

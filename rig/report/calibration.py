@@ -1,4 +1,4 @@
-"""The report on a calibration file: of what rig, how old, how it was judged, and what depth error it leaves."""
+"""The report on a calibration file: its rig, its age, the verdict on it, and the depth error that it leaves."""
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
@@ -29,7 +29,8 @@ def calibration_report(
 ) -> str:
     """The text of the HTML file on a calibration.
 
-    notes: what later checks found, by the name of the check. now: for its age. more: commands and files to name.
+    notes: what later checks found, by the name of the check. now: the present time, with its time zone, from which the
+    calibration's age follows. more: lines of text, such as the commands that made the calibration.
     """
     identity, errors = model.identity, _errors(model)
     failed = [f"{name}: {reason}" for name, note in notes.items() for reason in note.get("reasons") or ()]
@@ -104,7 +105,8 @@ def _expected(errors: Sequence[DepthUncertainty]) -> str:
 
 
 def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
-    """Section with a picture of the expected depth error: bright where it is large, black where no scan reaches."""
+    """Section with the expected depth error at one depth: its picture, and a table of its parts. A sentence if the scan
+    does not reach this depth."""
     if not np.isfinite(uncertainty.sd_m).any():
         return "Expected depth error", paragraph(f"The scan does not reach {uncertainty.depth_m:g} m.")
     rows = [(name, in_mm(float(np.nanmedian(part)))) for name, part in uncertainty.part_m.items()]
@@ -113,7 +115,7 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
 
 
 def uncertainty_picture(uncertainty: DepthUncertainty) -> str:
-    """The picture alone."""
+    """HTML of a picture of the expected depth error: bright where it is large, black where no scan reaches."""
     caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
     large = enlarged_mm(uncertainty.sd_m)
     low, high = depth_limits(large) or (0.0, 1.0)

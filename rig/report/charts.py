@@ -26,7 +26,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A curve, or single points. Those that are not finite or that a logarithmic axis cannot show are left out.
+    """A curve, or single points. Points that are not finite, or that a logarithmic axis cannot show, are left out.
 
     intervals: (low, high) in y of each point. names: small text beside each point. gaps: whether the curve breaks where
     a point is left out.
@@ -123,7 +123,11 @@ def chart_svg(
     notes: Sequence[str] = (),
     panel_px: tuple[int, int] = PANEL_PX,
 ) -> str:
-    """Draw an SVG file of panels in rows, `panel_px` for each, with a legend and lines of small print below."""
+    """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, lines of small print,
+    below.
+
+    panel_px: width and height of the place for each panel; a `Panel` itself is always drawn in PANEL_PX.
+    """
     across = min(across, len(panels))
     down = -(-len(panels) // across)
     width, panel_height = across * panel_px[0], panel_px[1]
@@ -165,7 +169,7 @@ def legend(series: Sequence[Series]) -> str:
 
 
 def panel_svg(panel: Panel) -> str:
-    """A single panel as SVG text without a title of its own and without a legend."""
+    """A single panel as SVG text, under the panel's own title and without a legend."""
     width, height = PANEL_PX
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '

@@ -12,14 +12,17 @@ Cell = Callable[[RunFacts], str]
 
 
 def compared(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Cell]]) -> str:
-    """A table with a column for each run; rows of which no run says anything are left out."""
+    """An HTML table with a column for each run; rows on which no run says anything are left out."""
     shown = [(words, *(cell(run) for run in runs)) for words, cell in rows]
     head = ("", *(run.name for run in runs)) if len(runs) > 1 else ("", "")
     return table(head, [row for row in shown if any(text not in ("-", "- x -", "- of -") for text in row[1:])])
 
 
 def figure(run: RunFacts, path: str, form: Callable[[Any], str] | None = None) -> str:
-    """A value of the summary as text; '-' if there is none."""
+    """A value of the summary as text; '-' if there is none. path: the value's keys, joined by dots.
+
+    form: makes the text of a number; values that are no numbers then give '-'.
+    """
     value = value_at(run.summary, path)
     if value is None:
         return "-"
@@ -38,12 +41,12 @@ def value_at(content: Mapping[str, Any], path: str) -> Any:
 
 
 def as_number(value: object) -> float | None:
-    """A number, or None for anything else."""
+    """The value as a float if it is a number; None for anything else, True and False included."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def as_whole(value: object) -> int | None:
-    """A whole number, or None for anything else."""
+    """The value if it is a whole number; None for anything else, True and False included."""
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 

@@ -1,7 +1,7 @@
 """Profiles of image rows: depth along the row, light of its stripes, and the counts around one stripe.
 
-The counts of a single column are few. So they stand beside the mean over the neighbouring columns, each shifted by
-whole pixels so that its stripe lies where that of the shown column lies.
+The counts of a single column are few. So the mean over the neighbouring columns is drawn with them. For this mean, each
+neighbour is shifted by whole pixels so that its stripe lies on that of the shown column.
 """
 
 import math
@@ -130,7 +130,11 @@ def _middle_column(run: RunFacts, row: int) -> int | None:
 
 
 def mean_profile(counted: RowCounts, stripe: Mapping[str, Float32], row: int, column: int) -> NDArray[np.float64]:
-    """Counts per exposure (width,), over the sure columns around one, with their stripes on that one's. NaN: none."""
+    """Mean counts per exposure (width,) of a column and its sure neighbours; NaN where none of them has counts.
+
+    Sure columns are those with a confidence of at least SURE. Each is shifted so that its stripe lies on that of
+    `column`, which must have a stripe.
+    """
     counts, x_px = counted.counts, stripe["x_px"][row]
     columns, width = counts.shape
     ones, exposures = np.zeros(width), np.zeros(width)

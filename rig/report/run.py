@@ -47,8 +47,10 @@ _COARSE: Final = 12
 
 
 def run_report(runs: Sequence[RunFacts]) -> str:
-    """The text of the HTML file on one run, or on two side by side; at most `MOST_BYTES`, with smaller pictures if need
-    be."""
+    """The text of the HTML file on one run, or on two side by side.
+
+    Pictures are made smaller while the text has more than `MOST_BYTES`; with the smallest ones it may still have more.
+    """
     for most_px in PICTURE_PX:
         text = _page(runs, most_px)
         if len(text.encode()) <= MOST_BYTES:

@@ -44,7 +44,8 @@ def _against_truth(key: str, form: Callable[[float], str]) -> Cell:
 
 
 def errors_section(runs: Sequence[RunFacts]) -> str:
-    """Tables of errors against the truth: over all, by distance, and whether confidence is what it says."""
+    """Tables of errors against the truth: over all, by distance, and by stated confidence. Empty if no run knows the
+    truth."""
     known = [run for run in runs if run.truth or run.summary.get("truth")]
     if not known:
         return ""

@@ -28,12 +28,12 @@ Read = TypeVar("Read")
 class RunFacts:
     """A run as far as it can be read. Arrays of pixels are (rows, width), those of stripes (rows, columns).
 
-    manifest, summary: contents of these files, empty if they are missing. recorded: whether the frames are there.
-    numbers: of the maps that are there. number: of the map that is shown, None without one. depth_m, confidence,
-    depth_sd_m: as in `rig.depth.depth.DepthMap`. stripe: arrays of the stripe table. truth: arrays `x_px`, `depth_m`.
-    counts: the picture of the summed counts. rows: of the picture, whose profiles are shown. counted: counts of these
-    rows in the recording. near_is_left: whether near points lie at smaller x. model: the calibration.
-    missing: a sentence for each thing that a report shows and this run has not.
+    manifest, summary: contents of these files, empty if they are missing. recorded: whether the run's folder has
+    frames. numbers: numbers of the maps that have files or whole frames. number: number of the map that is shown, None
+    without one. depth_m, confidence, depth_sd_m: as in `rig.depth.depth.DepthMap`. stripe: arrays of the stripe table.
+    truth: arrays `x_px`, `depth_m`. counts: the picture of the summed counts. rows: the image rows whose profiles are
+    shown. counted: the recorded counts of each of these rows. near_is_left: whether near points lie at smaller x.
+    model: the calibration. missing: a sentence for each thing that a report shows and this run lacks.
     """
 
     folder: Path
@@ -66,7 +66,7 @@ class RunFacts:
 
     @property
     def taken(self) -> datetime | None:
-        """Date and time of the run; None if it does not say."""
+        """Date and time of the run; None if it does not say, or does not say the time zone."""
         return _moment((self.manifest.get("rig") or {}).get("taken"))
 
     @property
@@ -84,7 +84,8 @@ class RunFacts:
 
 
 def read_run(folder: Path, number: int | None = None) -> RunFacts:
-    """Read a run, with one of its maps. number: of the map; None: the last one.
+    """Read a run and one of its maps. number: number of the map; None: the last one that was made, else the last
+    recorded one.
 
     Raises UsageError if the run has no map of this number.
     """

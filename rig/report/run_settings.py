@@ -19,7 +19,7 @@ from rig.report.run_facts import RunFacts
 
 def calibration_section(runs: Sequence[RunFacts]) -> str:
     """HTML table with a column for each run, on its calibration: id and file, verdicts, age at the run, what it was
-    made from, and the depth error that it leaves. Rows of which no run says anything are left out."""
+    made from, and the depth error that it leaves. Rows on which no run says anything are left out."""
 
     def provenance(run: RunFacts) -> str:
         said = {**(value_at(run.manifest, "calibration.provenance") or {})}
@@ -76,7 +76,7 @@ def commands_section(runs: Sequence[RunFacts]) -> str:
 
 
 def settings_section(runs: Sequence[RunFacts]) -> str:
-    """The whole config and the request of each run; of two runs first what differs."""
+    """HTML with the whole config and the request of each run; for two runs, the settings that differ come first."""
     asked = [{"config": run.manifest.get("config") or {}, "request": run.manifest.get("request") or {}} for run in runs]
     html = ""
     if len(runs) == 2:

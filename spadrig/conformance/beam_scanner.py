@@ -1,4 +1,4 @@
-"""The suite of every beam scanner: states, the exact clock, limits before anything moves, an end, a park."""
+"""The suite of every beam scanner: states, the exact clock, limits checked before anything moves, ends, parking."""
 
 import re
 from dataclasses import replace

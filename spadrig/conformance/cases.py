@@ -31,7 +31,8 @@ N_FRAMES = 500
 
 
 def require_final(device: Device, *verbs: Callable[[], object]) -> None:
-    """Leave the device's block by an error; assert that this closed it for good: no verb is possible any more."""
+    """Leave the device's `with` block by an error; assert that this closed the device for good: every verb raises
+    WrongState."""
     with pytest.raises(RuntimeError, match="on the way"), device as entered:  # noqa: PT012
         assert entered is device
         raise RuntimeError("on the way")
@@ -55,7 +56,7 @@ class SpadCase:
 
 @dataclass(frozen=True)
 class Taken:
-    """A run of a SPAD array that is over: its blocks, all still in the ring, and the counters behind it."""
+    """A run of a SPAD array that is over: its blocks, all still in the ring, and the counters after it."""
 
     case: SpadCase
     timing: SpadTiming
@@ -65,7 +66,10 @@ class Taken:
 
 
 def run(case: SpadCase, timing: SpadTiming, n_frames: int) -> tuple[BlockRing, list[FrameBlock]]:
-    """One run to its end, in a ring that takes it all, however short the device makes its blocks after a loss."""
+    """Run a SPAD array to its end; returns the ring and the blocks in it.
+
+    The ring has room for all of them, however short the device makes its blocks after a loss.
+    """
     ring = BlockRing(2 * n_frames // case.request.block_frames + n_frames // 8, timing.stride)
     reader = ring.reader("test")
     case.device.start(n_frames)
@@ -84,8 +88,8 @@ def take(case: SpadCase) -> Taken:
 
 @dataclass(frozen=True)
 class ScannerCase:
-    """A scanner, open. `turning` tells whether the mirror really moves, also after the device was closed. `let_pass`
-    lets so many seconds pass for it."""
+    """A scanner, open. `turning` tells whether the mirror really moves, even after the device was closed. `let_pass`
+    lets a number of seconds pass for it."""
 
     device: BeamScanner
     turning: Callable[[], bool]
@@ -94,7 +98,7 @@ class ScannerCase:
 
 @dataclass(frozen=True)
 class LaserCase:
-    """A laser, open and off. `shining` tells whether it would shine through an open gate, also after close."""
+    """A laser, open and off. `shining` tells whether it would shine through an open gate, even after close."""
 
     device: LineLaser
     clock: Clock
@@ -105,7 +109,7 @@ class LaserCase:
 class SyncCase:
     """A sync source that is open.
 
-    trigger: sends one scan marker to its input. pins: reads its outputs, also after it is closed. waiting: state in its
+    trigger: sends one scan marker to its input. pins: reads its outputs, even after it is closed. waiting: state in its
     status while a program waits. plays: whether its outputs follow the program; those of a stand-in always stay low.
     step_s: time of a step of the program, much longer than the delays of the wire, so that the suite can see each step.
     """

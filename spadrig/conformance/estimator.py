@@ -1,7 +1,7 @@
-"""The suite of every estimator: what a stripe table promises for any counts, and a clear stripe found where it is.
+"""The suite of every estimator: its stripe tables keep their promises for any counts, and it finds a clear stripe.
 
 The sweeps are drawn here, without the simulator: a flat, slightly turned wall behind fog, seen by a small rig with the
-mirror on its left. An estimator must be told nothing of that.
+mirror on its left. Only the counts tell an estimator of that scene.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def rig_geometry() -> SweepGeometry:
 
 
 def true_stripe_px() -> NDArray[np.float32]:
-    """Position of the stripe, (rows, columns): of a wall at 3 to 3.4 m."""
+    """Position in px of the stripe on a wall at 3 to 3.4 m, float32 (rows, columns)."""
     angle = np.arctan2(np.linspace(-1.2, 1.2, COLUMNS) + BASELINE_M, 3.0)
     depth_m = np.linspace(3.0, 3.4, ROWS)[:, None]
     x_m = -BASELINE_M + depth_m * np.tan(angle)
@@ -51,7 +51,7 @@ def true_stripe_px() -> NDArray[np.float32]:
 
 
 def flux(geometry: SweepGeometry) -> NDArray[np.float64]:
-    """Detections per pixel and exposure, (columns, rows, width): fog that fades away from the camera, then the wall."""
+    """Photons per pixel and exposure, (columns, rows, width): fog that fades away from the camera, then the wall."""
     x = np.arange(float(WIDTH))
     behind = x - true_stripe_px().T[:, :, None]
     if not geometry.near_is_left:
@@ -61,7 +61,8 @@ def flux(geometry: SweepGeometry) -> NDArray[np.float64]:
 
 
 def sweep_of(counts: NDArray[np.unsignedinteger], geometry: SweepGeometry, exposures: int) -> CountVolume:
-    """A counted sweep of whole rows (columns, rows, width), in the geometry's windows. Column 3 has no frames."""
+    """A counted sweep from counts of whole rows (columns, rows, width), cut to the geometry's windows. Column 3 has no
+    frames."""
     used = np.zeros((COLUMNS, ROWS, geometry.window), counts.dtype)
     for column, first in enumerate(geometry.x0):
         part = counts[column, :, first : first + geometry.window]
@@ -100,7 +101,8 @@ def require_promises(table: StripeTable, sweep: CountVolume, geometry: SweepGeom
 
 
 class EstimatorSuite:
-    """Tests of an estimator. The fixture `create_estimator` gives a function from threads to a fresh estimator."""
+    """Tests of an estimator. The fixture `create_estimator` gives a function that takes a number of threads and returns
+    a fresh estimator."""
 
     @pytest.fixture
     def geometry(self) -> SweepGeometry:

@@ -12,7 +12,8 @@ _LOOK_S = 0.5
 
 
 def arm(case: LaserCase) -> None:
-    """Arm at a usual power and wait for emission, which may follow late: a warm-up, a safety delay."""
+    """Arm in the middle of the power range and wait for emission, which may follow after a warm-up or a safety delay.
+    Fails after WARM_UP_S."""
     limits = case.device.limits
     case.device.arm((limits.min_power_w + limits.max_power_w) / 2)
     for _ in range(int(WARM_UP_S / _LOOK_S)):
@@ -23,7 +24,10 @@ def arm(case: LaserCase) -> None:
 
 
 def check_dark(case: LaserCase, *, armed: bool) -> None:
-    """Assert that it is dark; of one that only its gate ends, that nobody can take it for dark."""
+    """Assert that the laser is dark. If only a gate ends its light, assert that it shines and says so.
+
+    armed: what its status must say.
+    """
     status = case.device.status
     assert (status.emission, status.armed) == (case.device.gate_only, armed)
     assert case.shining() == case.device.gate_only

@@ -1,4 +1,5 @@
-"""The suite of every SPAD array: contiguous frames with records, counters that add up, an end that ends."""
+"""The suite of every SPAD array: contiguous frames with records, counters that add up, runs that end when they
+should."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress

@@ -39,7 +39,7 @@ SURE, MOST_WRONG = 0.9, 0.01
 
 @cache
 def world(folder: str, lux: float) -> Any:
-    """The world with the suite's rig and wall, in ambient light of `lux`. folder: for its files."""
+    """The world with the suite's rig and wall, in ambient light of `lux`. folder: where its files are written."""
     geometry = Path(folder) / "rig.yaml"
     geometry.write_text(yaml.safe_dump(_calibration()), encoding="utf-8")
     surfaces = Path(folder) / "wall"
@@ -81,9 +81,9 @@ def _calibration() -> dict[str, Any]:
 
 
 class StrategyBench:
-    """Makes apparatus for the suite, and knows the truth. folder: for files.
+    """Makes apparatus for the suite, and knows the truth. folder: where files are written.
 
-    geometry: of the rig. scored: (rows, width), pixels that the source lights and the camera sees.
+    geometry: that of the rig. scored: (rows, width), pixels that the source lights and the camera sees.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -95,7 +95,8 @@ class StrategyBench:
         self._true_m = truth.depth_m
 
     def apparatus(self, strategy: Strategy, *, lit: bool = True, seed: int = 0) -> Apparatus:
-        """An apparatus with light, or in full darkness. Without a source of its own, light is that of a lit room."""
+        """An apparatus with light, or in full darkness. A strategy without a light source of its own gets the light of
+        a lit room."""
         lux = 0.0 if not lit else 50.0 if strategy.light == "ambient" else 1.0
         made: Apparatus = world(self._folder, lux).apparatus(
             rows=np.arange(ROWS), columns=COLUMNS, command_range=COMMANDS, power_w=POWER_W if lit else 0.0,
@@ -104,7 +105,8 @@ class StrategyBench:
         return made
 
     def measured(self, strategy: Strategy, apparatus: Apparatus, time_s: float, seed: int) -> Answer:
-        """The answer of a strategy, whose form is required to be that of `Answer`."""
+        """The answer of a strategy. Asserts that its form is that of `Answer` and that its depths are positive, or NaN
+        where there is no answer."""
         answer = strategy.measure(apparatus, self.geometry, Budget(time_s), seed)
         require_form(answer, strategy.name, (ROWS, WIDTH))
         given = np.isfinite(answer.depth_m)
@@ -126,7 +128,7 @@ class StrategySuite:
     """
 
     def most_wrong(self, strategy: Strategy) -> float:
-        """Largest share of sure answers in the dark."""
+        """Largest share of the pixels for which an answer in the dark may be sure."""
         return MOST_WRONG
 
     def test_says_what_it_is(self, strategy: Strategy) -> None:

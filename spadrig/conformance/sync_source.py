@@ -12,13 +12,13 @@ from spadrig.conformance.cases import SyncCase, require_final
 
 
 def sweep(case: SyncCase) -> list[Pulse]:
-    """Wait for the scan marker, settle, light, dark."""
+    """Pulses of one sweep: wait for the scan marker, settle, light, dark."""
     words = Pulse(0, case.step_s), Pulse(OUT_GATE | OUT_FRAME, case.step_s), Pulse(0, case.step_s)
     return [Pulse(OUT_MARKER, None), *words]
 
 
 def running(case: SyncCase, repeats: int = 2) -> None:
-    """The program, triggered once, in the middle of its lit word."""
+    """Start the program, trigger it once and wait until the middle of its lit pulse."""
     case.device.program(sweep(case), repeats)
     case.device.run()
     case.trigger()
@@ -31,7 +31,7 @@ class SyncSourceSuite:
 
     @pytest.fixture
     def playing(self, sync: SyncCase) -> None:
-        """Only sources whose outputs follow their program."""
+        """Skips the test for a source whose outputs do not follow its program."""
         if not sync.plays:
             pytest.skip("a stand-in plays nothing")
 
