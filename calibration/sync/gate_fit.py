@@ -18,6 +18,7 @@ from edges at other places within their frames. The ones are assumed to scatter 
 show it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -71,9 +72,11 @@ def fit_edge(
 
 
 def edge_time(edges: Sequence[Edge], times_s: Array) -> tuple[float, float]:
-    """The time (s) that all edges share and its sd, which is larger if they disagree. times_s: (times,), evenly
-    spaced."""
+    """The time (s) that all edges share and its sd, which is larger if they disagree; NaN for both if no time is
+    possible for all of them. times_s: (times,), evenly spaced."""
     chi2 = np.sum([edge.chi2 for edge in edges], axis=0)
+    if not np.isfinite(chi2).any():
+        return math.nan, math.nan
     apart = (chi2.min() - sum(edge.chi2.min() for edge in edges)) / max(len(edges) - 1, 1)
     likely = np.exp(-0.5 * (chi2 - chi2.min()) / max(apart, 1.0))
     likely /= likely.sum()

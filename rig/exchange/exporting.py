@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.errors import ProtocolError
+from drivers.errors import DeviceNotFound, ProtocolError
 from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from drivers.recorded.segments import segment_files
@@ -149,7 +149,7 @@ class _Export:
                     yield block
                     done += block.n_frames
                     self._told(done, recording.frames)
-        except ProtocolError as error:
+        except (ProtocolError, DeviceNotFound) as error:
             raise DamagedRecordingError(str(error)) from error
         self.damage += recording.problems
 

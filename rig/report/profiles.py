@@ -111,7 +111,7 @@ def _counts(run: RunFacts, row: int, of: str) -> Iterator[Panel]:
         Series("stripe", RUN_COLOURS[0], [(at, 0.0), (at, top)], dashed=True, marker=False),
     ]
     true_px = run.truth.get("x_px")
-    if true_px is not None and np.isfinite(true_px[row, column]):
+    if true_px is not None and true_px.shape == run.stripe["x_px"].shape and np.isfinite(true_px[row, column]):
         true_at = float(true_px[row, column])
         series.append(Series("true stripe", _TRUTH, [(true_at, 0.0), (true_at, 0.5 * top)], marker=False))
     yield Panel(f"Counts, column {column}{of}", "x, px", "counts per exposure", series, x_log=False, y_log=False)

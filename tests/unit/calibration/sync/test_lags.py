@@ -321,6 +321,12 @@ def test_edges_are_found_within_a_frame(rises: bool) -> None:
     assert abs(np.mean(off)) < 0.3
 
 
+def test_edges_that_can_share_no_time_give_none() -> None:
+    early = np.where(np.arange(len(TIMES_S)) < 10, 1.0, np.inf)
+    found = edge_time([Edge(early, 5.0, 1.0), Edge(early[::-1], 5.0, 1.0)], TIMES_S)
+    assert np.isnan(found).all()
+
+
 @pytest.mark.parametrize("rises", [True, False])
 @pytest.mark.parametrize("flux", [0.7, 300.0])
 def test_a_line_that_saturates_says_less_and_nothing_wrong(flux: float, rises: bool) -> None:

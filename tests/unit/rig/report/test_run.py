@@ -115,6 +115,13 @@ def test_arrays_that_are_none_of_a_map_are_named(run: Path) -> None:
     assert "The stripe table cannot be read: 000000.npz has no confidence, signal, haze." in words
 
 
+def test_a_truth_of_another_size_is_left_out(run: Path) -> None:
+    truth = dict(np.load(run / "truth/000000.npz"))
+    assert "Is the confidence true?" in report(run)
+    np.savez(run / "truth/000000.npz", **{**truth, "x_px": truth["x_px"][:2, :2]})
+    assert "Is the confidence true?" not in report(run)
+
+
 def test_a_run_without_maps_frames_and_summary_still_has_a_page(run: Path) -> None:
     for part in ("depth", "confidence", "stripe", "cloud", "intensity", "truth"):
         shutil.rmtree(run / part)
