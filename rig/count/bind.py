@@ -174,7 +174,8 @@ class FrameBinder:
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Sweep, column and bin of the block's frames, and the clocks of the sweeps that the block closes. Raises
-        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does."""
+        ProtocolError if more than MOST_OUT_OF_TURN frames of a sweep name a wrong sweep, and DeviceFault as
+        `BlankingSync.mark` does."""
         header, n = block.header, block.n_frames
         if self._t0 is None:
             self._t0 = header.t0_ticks

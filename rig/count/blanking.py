@@ -99,9 +99,11 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether the pattern may lie in it.
+        """Best score in each window of `ones` (n,), NaN if one of its frames is lost, and whether the pattern may lie
+        in it.
 
-        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has."""
+        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has.
+        """
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -122,8 +124,8 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing. Returns None also if frames of `span` lie outside, or
-        too many are missing.
+        ones: of frames `first`, first + 1, ... , NaN if missing. place: of the first edge, in frames. None also if
+        frames of `span` lie outside `ones`, or too many are missing.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):

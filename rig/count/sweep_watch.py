@@ -1,4 +1,4 @@
-"""Order and time of a sweep's frames, which their counts no longer show: are they of one map, and of their columns?
+"""Checks the order and time of a sweep's frames, which counts no longer show: are all of one map, each of its column?
 
 - *Frames of one scene.* The line moves by a fraction of its width from frame to frame and from column to column, so a
   frame has more ones in common with the next one than with the next but one, and more with the next column than with
@@ -96,7 +96,7 @@ class SweepWatch:
     exposures: frames per column. frames: lit ones of a map. gate: for each leg, when the gate opens and closes, in
     frames since the mirror enters the first column; empty if frames have no marks. delay: of the light after the gate,
     in frames, as far as it is known. exposed: share of a frame's period. whole: whether the frames are of the whole
-    sensor, so that their ones tell of light. every: one of so many sweeps is watched, the first one among them.
+    sensor, so that their ones tell of light. every: of each `every` sweeps the first one is watched.
     """
 
     def __init__(
@@ -120,9 +120,12 @@ class SweepWatch:
         self, bits: NDArray[np.uint8], numbers: NDArray[np.int64], lit: Bools, x0: NDArray[np.int32],
         since: Float64 | None = None, marks: NDArray[Any] | None = None, leg: int = 0,
     ) -> None:  # fmt: skip
-        """Look at frames of the sweep: packed bits (n, rows, row bytes), and (n,) numbers, whether they are counted for
-        a column, first used pixels, middles of exposures in frames since the mirror entered the first column, and
-        marks. Frames come in order."""
+        """Look at n frames of the sweep, which come in order.
+
+        bits: packed, (n, rows, row bytes). The other arrays are (n,). numbers: of the frames. lit: whether they are
+        counted for a column. x0: first used pixels. since: middles of exposures in frames since the mirror entered the
+        first column. marks: of the records; None if there are none. leg: the sweep's, an index of `gate`.
+        """
         if self._sweeps % self._every:
             return
         if self._first is None and lit.any():
@@ -139,7 +142,7 @@ class SweepWatch:
                     self._seen.append((since[part], marks[part].astype(np.int64), ones))
 
     def finish(self, leg: int = 0) -> tuple[str, ...]:
-        """Doubts about the sweep, at most one; the next one begins. leg: the sweep's."""
+        """Doubts about the sweep: at most one sentence. The next sweep begins. leg: the sweep's, an index of `gate`."""
         skipped = self._sweeps % self._every
         self._sweeps += 1
         if skipped:

@@ -168,7 +168,8 @@ class SweepTally:
         self._dark_frames = np.zeros(self._layout.padded_width, np.int32)
 
     def note(self, bins: NDArray[np.int32], column: NDArray[np.float64], first_word: NDArray[np.int32]) -> None:
-        """Record the frames of a block. first_word: (n,), word at which each one's used pixels begin."""
+        """Record the frames of a block; bins, column: as in `Counter.add`. first_word: (n,), word at which each frame's
+        used pixels begin."""
         lit = bins >= 0
         if lit.any():
             here, columns = bins[lit], self._layout.columns
@@ -270,7 +271,8 @@ class LineCounter(SweepCounter):
         self.reset()
 
     def finish(self) -> CountVolume:
-        """The counts so far. A column has its mirror place's frames and their mean distance from the place's centre."""
+        """The counts so far. `n_frames` of a column is that of its mirror place; `column` is the column's index plus
+        the mean distance of these frames from the place's centre."""
         place, volume = self._grid.place, super().finish()
         column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
         return replace(volume, n_frames=volume.n_frames[place], column=column)
