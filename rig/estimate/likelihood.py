@@ -53,7 +53,8 @@ class Likelihood:
         return _LikelihoodCounter(self, layout, geometry, self._workers)
 
     def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
-        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
+        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep. Raises UsageError if `model`
+        was learned from a sweep of another size, and what a failed lesson raised."""
         if isinstance(sweep, SearchedSweep):
             assert self.model is not None, "a sweep is judged under a model"
             used, found = self.model, sweep.stripe

@@ -407,7 +407,7 @@ def exchange(
 ) -> None:
     """Exchange both returns where rows first_row..last_row-1 have specks.
 
-    The answer gets the mean deviation, signal and haze of the answers around it on its new surface, and the smaller of
+    The answer gets the mean x_sd_px, signal and haze of the answers around it on its new surface, and the smaller of
     the second return's confidence and their mean confidence. table: the arrays of a `StripeTable`.
     """
     x_px, confidence, sd_px, signal, haze, x2_px, confidence2 = table

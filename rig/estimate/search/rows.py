@@ -161,7 +161,7 @@ def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> Search
 def count_fluxes() -> Float32:
     """Photons per exposure estimated from n ones in k exposures, float32: log((k + 1/2) / (k - n + 1/2)).
 
-    Nearly unbiased, and finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
+    Nearly unbiased, and finite even at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
     than COUNT_LIMIT, since halved counts are rounded up.
     """
     parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]

@@ -49,7 +49,7 @@ _AHEAD: Final = 2
 
 
 class Contrast(NamedTuple):
-    """Settings of these costs under one model.
+    """Settings of the contrast costs under one model.
 
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
     count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
@@ -80,14 +80,14 @@ def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
 
 
 def share_of(belief: float) -> int:
-    """Share of the model's costs in the mean with these costs, in 1 / WHOLE: a half if the model is fully believed."""
+    """Weight of the model's costs in their mean with the contrast costs, in 1 / WHOLE: a half under full belief."""
     return round(WHOLE * belief / (1.0 + belief))
 
 
 def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, share: int) -> None:
-    """Replace the costs of rows first..last-1 by the weighted mean of them and of these costs.
+    """Replace the costs of rows first..last-1 by the weighted mean of these costs and the contrast costs.
 
-    share: weight of the former costs in 1 / WHOLE, 0 for these costs alone.
+    share: weight of the former costs in 1 / WHOLE; 0 for the contrast costs alone.
 
     cost: uint8 (rows, columns, labels) of all rows. EXCLUDED labels and columns without frames keep their costs.
     Threads may fill different rows at once.

@@ -108,10 +108,10 @@ def fill_tables(
 ) -> None:  # fmt: skip
     """Fill the tables of bands first_band..last_band-1.
 
-    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS x
-    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8
-    to 3/8 px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat:
-    units of weight per nat; most: largest sum of the sizes of a position's weights.
+    state: without ambient light. ambient: (rows, width), used for pixels that are not `hot`. light: (LIGHTS x pairs,)
+    photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8 to 3/8
+    px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat: units
+    of weight per nat; most: largest sum of the sizes of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]

@@ -142,7 +142,8 @@ def line_width(
 
 
 def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
-    """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of stripes behind each.
+    """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of the stripes that each
+    of them represents.
 
     trusted: (rows, columns), which stripes count; None for all. If none counts, the amplitudes are 1.
     """

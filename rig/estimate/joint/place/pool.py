@@ -109,7 +109,8 @@ def pool_amplitude(
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its new place, both at most 1 px.
+    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its new place, both at most 1 px in
+    size.
 
     reaches: of neighbourhoods, smallest first; the first with `enough` information (1/px^2) is taken, else the last.
     """
