@@ -96,7 +96,8 @@ class SweepClock:
 
     @property
     def synchronised(self) -> bool:
-        """Whether the columns of this sweep's frames can be trusted; False if residual_columns is NaN."""
+        """Whether columns of the sweep's frames can be trusted: small residual (not NaN) and clock error, wrong_way and
+        unlit 0."""
         return (
             self.residual_columns <= MAX_RESIDUAL_COLUMNS
             and abs(self.clock_error) <= MAX_CLOCK_ERROR

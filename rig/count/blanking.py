@@ -199,7 +199,7 @@ class MarkerLine:
     sd: list[float] = field(default_factory=list)
 
     def add(self, index: int, place: float, sd: float) -> None:
-        """Add one more scan marker."""
+        """Add one more scan marker; its standard deviation counts as LEAST_SD_FRAMES at least."""
         self.index.append(index)
         self.place.append(place)
         self.sd.append(max(sd, LEAST_SD_FRAMES))
@@ -231,10 +231,11 @@ ASIDE_PX = 64
 class SweepPlace:
     """Place of a sweep among the frames.
 
-    frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time. patterns: number of patterns that these are fitted to. found: the sweep's own pattern;
-    None if the place is taken from the line through the others. residual_frames: distance of its pattern from the place
-    predicted by earlier ones, or that distance's standard deviation if larger; NaN without a pattern.
+    number: of the sweep, see `BlankingSync`. frame: the first one that counts. scan_frame: place of its scan marker, in
+    frames. ratio: of the scanner's clock to nominal, in the SPAD's time. patterns: number of patterns that these are
+    fitted to. found: the sweep's own pattern; None if the place is taken from the line through the others.
+    residual_frames: distance of its pattern from the place predicted by earlier ones, or that distance's standard
+    deviation if larger; NaN without a pattern.
     """
 
     number: int

@@ -51,7 +51,7 @@ class RowFollower:
         self._followed: FollowedRow | None = None
 
     def reset(self) -> None:
-        """Begin the next sweep."""
+        """Begin the next sweep, and ask which row is wanted in it."""
         row = self._wish.wanted()
         self._followed = None if row is None else FollowedRow(row, np.zeros(self._shape, np.uint16))
         self._counter.reset()
@@ -59,7 +59,7 @@ class RowFollower:
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
     ) -> None:
-        """Add frames as in `Counter`."""
+        """Add frames as in `Counter`. An error in counting the row is logged and ends the following for this sweep."""
         followed = self._followed
         if followed is not None and 0 <= followed.row < bits.shape[1]:
             try:
@@ -74,7 +74,7 @@ class RowFollower:
         self._counter.settle(under_way)
 
     def finish(self) -> FrameTally:
-        """The sweep as the other counter has counted it."""
+        """The sweep as the other counter has counted it. The followed row, if any, is handed over first."""
         if self._followed is not None:
             self._wish.found(self._followed)
             self._followed = None

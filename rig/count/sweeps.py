@@ -79,10 +79,10 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class FirstSweep:
-    """The first sweep of a start that is made into a map. Its number is 0, unless the frames are a part that was cut
-    from a recording.
+    """The first sweep of a start from which a map is made.
 
-    clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
+    sweep: its number, 0 unless the frames are a part that was cut from a recording. Frames of earlier sweeps are not
+    counted. clock_ratio: as in `FrameBinder`.
     """
 
     sweep: int = 0

@@ -87,8 +87,8 @@ class FrameTally:
     doubts: tuple[str, ...] = ()
 
     def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts. workers: threads
-        that share the work."""
+        """Counts summed over the columns, (rows, width) uint32. workers: threads that share the work. Raises
+        NotImplementedError except in subclasses that keep counts."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
@@ -133,10 +133,10 @@ class Counter(Protocol):
     ) -> None:
         """Add packed frames `bits` (n, rows, row bytes) to `bins` (n,); `column` (n,): each frame's fractional column.
 
-        Row bytes are a multiple of 8. Bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
-        one another. x0: (n,), first used pixel of each frame, a multiple of 64; if rows are shorter than the sensor's,
-        their first pixel. The used pixels of a frame on a column must contain that column's window. The frames may
-        still be read after this returns, see `settle`.
+        Row bytes are a multiple of 8. A bin is a column (with several lines, a place of the mirror), BIN_DARK or
+        BIN_UNUSABLE; the frames of a column follow one another. x0: (n,), first used pixel of each frame, a multiple of
+        64; if rows are shorter than the sensor's, their first pixel. The used pixels of a frame on a column must
+        contain that column's window. The frames may still be read after this returns, see `settle`.
         """
 
     def settle(self, under_way: int = 0) -> None:
@@ -197,7 +197,7 @@ class SweepTally:
 
 
 def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
-    """The counts in a type wide enough for columns of `n_frames` (columns,) frames without overflow."""
+    """`counts`, or a copy in a wider type if columns of `n_frames` (columns,) frames could overflow."""
     most = int(n_frames.max(initial=0))
     for wider in (np.uint16, np.uint32):
         if most <= np.iinfo(counts.dtype).max:

@@ -58,7 +58,7 @@ class StripeTable:
 
     @classmethod
     def empty(cls, rows: int, columns: int) -> "StripeTable":
-        """A table without any estimate."""
+        """A table without any estimate: confidence 0, all else NaN, no second stripes (None)."""
         nan = [np.full((rows, columns), np.nan, np.float32) for _ in range(4)]
         return cls(nan[0], np.zeros((rows, columns), np.float32), nan[1], nan[2], nan[3])
 

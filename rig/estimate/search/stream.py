@@ -81,7 +81,7 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
-    """Add the 8-bit sums light_here and quiet_here to light and quiet, and clear them. x0: where their window begins."""
+    """Add the 8-bit sums light_here and quiet_here to light and quiet, and clear them. x0: their first pixel."""
     _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
     _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
