@@ -169,7 +169,8 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """The model of a first sweep, learned twice: once stripes are found, pixels behind them show the ambient light."""
+    """The model of a first sweep, learned twice: at first without, then with the ambient light that pixels behind the
+    stripes show."""
     intensity = volume.intensity(workers)
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

@@ -153,8 +153,8 @@ def create_estimator(
 def estimate_problems(
     estimator: str | None, filter: str | None, min_confidence: float | None, known: Sequence[str]
 ) -> list[str]:
-    """A line for each of these settings that is not allowed. A setting that is None is not given, and allowed. known:
-    the estimators that may be named."""
+    """A line for each of these settings that is not allowed. A setting that is None was not given and is no problem.
+    known: the estimators that may be named."""
     problems = []
     if estimator is not None and estimator not in known:
         problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(known)}")

@@ -370,8 +370,8 @@ def find_specks(
     """Fill speck (rows, columns), whether answers of rows first_row..last_row-1 are specks before a lit surface.
 
     distance, distance2: of answer and second return from the far end in px, NaN where there is none; signal: of
-    `StripeTable`; ones, expected: of `SecondReturns`. The light is tested on the speck's own row, since the wall around
-    a small opaque thing is lit too. All float32 (rows, columns).
+    `StripeTable`; ones, expected: of `SecondReturns`. The light is tested on the speck's own row, since the surface
+    around a small opaque thing is lit too. Arrays are float32 (rows, columns), n_frames (columns,).
     """
     rows, columns = distance.shape
     for y in range(first_row, last_row):

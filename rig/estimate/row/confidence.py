@@ -102,7 +102,7 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
 def believed(
     found: StripeTable, reference_px: Float32, exposures: Int32, ambient: float, line_px: int, workers: RowWorkers
 ) -> StripeTable:
-    """The stripe table `found` by the search, with confidences from neighbours and without negative signals.
+    """The stripe table `found` by the search, with confidences from neighbours and with negative signals set to 0.
 
     reference_px: (rows, columns), position of the line at a fixed depth; other arguments: see `confidences`.
     """

@@ -54,7 +54,8 @@ _NEAR, _FAR = 0, 1
 class LabelTables(NamedTuple):
     """Tables of all bands and columns, see the module.
 
-    P: pixels of a row, V: vectors of pixels that hold labels, from pixel FAR_PX on. Phases: far and near half of each.
+    P: pixels of a row, V: vectors of pixels that hold labels, from pixel FAR_PX on. PHASES: the far and the near half
+    of a pixel.
 
     at: int32 (bands, columns, VARIANTS), index of the table, -1 if there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure if
