@@ -232,10 +232,10 @@ class SweepPlace:
     """Place of a sweep among the frames.
 
     number: of the sweep, see `BlankingSync`. frame: the first one that counts. scan_frame: place of its scan marker, in
-    frames. ratio: of the scanner's clock to nominal, in the SPAD's time. patterns: number of patterns that these are
-    fitted to. found: the sweep's own pattern; None if the place is taken from the line through the others.
-    residual_frames: distance of its pattern from the place predicted by earlier ones, or that distance's standard
-    deviation if larger; NaN without a pattern.
+    frames. ratio: of the scanner's clock to nominal, in the SPAD's time. patterns: number of patterns that scan_frame
+    and ratio are fitted to. found: the sweep's own pattern; None if the place is taken from the line through the
+    others. residual_frames: distance of its pattern from the place predicted by earlier ones, or that distance's
+    standard deviation if larger; NaN without a pattern.
     """
 
     number: int

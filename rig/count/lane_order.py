@@ -73,7 +73,7 @@ def read_planes(
     """Write the counts of two rows of `window` pixels to n and to the row after it, from their bit planes.
 
     planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart. n_planes: number
-    of planes, 1, 2, 4 or 8. lanes: as in `pair_bytes`. Reads 16 bytes at a time, whatever the window.
+    of planes, 1, 2, 4 or 8. lanes: as in `pair_bytes`. Reads 16 bytes at a time, possibly beyond the rows.
     """
     pair = pair_bytes(lanes)
     for v in range(0, lanes, LANES):

@@ -1,4 +1,4 @@
-"""Checks the order and time of a sweep's frames, which counts no longer show: are all of one map, each of its column?
+"""Checks that the frames of a sweep are of one map, and each of its column. Their counts no longer show this.
 
 - *Frames of one scene.* The line moves by a fraction of its width from frame to frame and from column to column, so a
   frame has more ones in common with the next one than with the next but one, and more with the next column than with
@@ -97,8 +97,8 @@ class SweepWatch:
     exposures: frames per column. frames: number of lit frames of a map. gate: for each leg, when the gate opens and
     closes, in frames since the mirror enters the first column; empty if frames have no marks. delay: of the light after
     the gate, in frames, as far as it is known. exposed: exposure as a share of a frame's period. whole: whether the
-    frames are of the whole sensor, so that their ones tell of light. every: of each `every` sweeps the first one is
-    watched.
+    frames are of the whole sensor; only then do their ones show when light begins and ends. every: of each `every`
+    sweeps the first one is watched.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The stripe table: where the laser line was seen on every row and column, with what certainty, and its errors.
+"""The stripe table: where the laser line was seen on every row and column, and how certainly; errors of such tables.
 
 Arrays of stripes are (rows, columns). The errors are relative to a truth that a simulated world or a test knows.
 """

@@ -130,9 +130,9 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x, by coordinate descent.
+    """The x without negative elements that minimises x' matrix x - 2 right' x, by coordinate descent.
 
-    free: index of the only x that may be negative; -1 if none may.
+    free: index of an element that may be negative; -1 for none.
     """
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):

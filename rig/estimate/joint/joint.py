@@ -58,7 +58,7 @@ next lesson may have many that agree on a wrong place."""
 
 
 class Joint:
-    """The row likelihood tied to the neighbours', with the state it has learned so far.
+    """The row likelihood tied to that of the neighbours, with the state that it has learned so far.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.

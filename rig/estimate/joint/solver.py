@@ -110,7 +110,7 @@ class MapSolver:
         return x_px
 
     def teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The last map's stripe table with the trust of `fill_trust` in place of the confidence."""
+        """`stripes`, the last map's stripe table, with the trust of `fill_trust` in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),

@@ -156,8 +156,9 @@ def search_frames(
     """Count and judge a block; returns the column that is open after it.
 
     words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are skipped; first_word:
-    (n,) of each frame's window; row_words: words of a row; end: whether the sweep ends here, so that no column stays
-    open; desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
+    (n,) of each frame's window; row_words: words of a row; open_column: the column that is open before it; end: whether
+    the sweep ends here, so that no column stays open; desk: with a thread's own memory; planes: see `new_planes`. Only
+    chunks first_chunk..last_chunk-1 are touched.
     """
     rows = desk.judge.rows
     frame = rows * row_words

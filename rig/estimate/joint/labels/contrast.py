@@ -6,8 +6,8 @@ ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
     p = sum w_t n_t / K,    N = K / sum w_t^2
     score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
 
-which is the log-likelihood ratio of p to p0 for N frames, the effective number with the weights of a matched filter.
-As in `rig.estimate.joint.labels.costs`,
+The score is the log-likelihood ratio of p to p0; N is the effective number of frames with these weights, those of a
+matched filter. As in `rig.estimate.joint.labels.costs`,
 
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
 

@@ -311,14 +311,15 @@ class Fitted(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
+    """Working memory for BATCH rows, int16 (BATCH, ...) unless stated otherwise.
 
     n: counts of pixels from far to near; sums: for each pixel, from SUMS_FROM on, the score if all farther pixels lie
     behind the stripe; score: of pixel and phase; top: the largest score in each lane of each row; in the end the first
     LANES hold that of each row. cost: uint8, from the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
     EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
-    int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
-    batch; fitted: its index in `Fitted`; shown: first label that the mask leaves, and the one after the last.
+    int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: number of the table of
+    each row of the batch; fitted: index of that table in `Fitted`; shown: first label that the mask leaves, and the one
+    after the last.
     """
 
     n: Int16

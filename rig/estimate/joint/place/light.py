@@ -14,9 +14,9 @@ D = 1 / (e^flux - 1) (`score_places`),
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
-are the derivative of the log-likelihood by position (1/px) and the Fisher information on it (1/px^2). For a pixel
-that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no information.
-Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
+are the derivative of the log-likelihood with respect to position (1/px) and the Fisher information on it (1/px^2). For
+a pixel that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no
+information. Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
 from typing import Final

@@ -129,7 +129,8 @@ def weigh_light(
 def line_width(
     volume: CountVolume, sweep: Sweep, state: RowState, stripes: StripeTable, workers: RowWorkers
 ) -> float | None:
-    """Standard deviation of the line in px, from the light of clear stripes; None if there is too little of it."""
+    """Standard deviation of the line in px, from the light of clear stripes, limited to LINE_SIGMA_PX. None if there is
+    too little light."""
     sums = np.zeros((stripes.x_px.shape[0], 2))
     clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
     seen = volume.counts, volume.n_frames, sweep, state, *clear
