@@ -106,7 +106,8 @@ class ManyMaps(Protocol):
         ...
 
     def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
-        """Begin a map with a solver that no other map uses. Call the result's `run` on any thread, then `end`."""
+        """Begin a map with a solver that no other map uses until `end`. Call the result's `run` on any thread, then
+        `end`."""
         ...
 
     def end(self, work: Any) -> None:

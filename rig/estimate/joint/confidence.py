@@ -173,7 +173,8 @@ def apart_row(placed: Float32, row: int, out: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def light_row(distance: Float32, light: Float32, row: int, number: Float32, total: Float32) -> None:
-    """Write the number of 3 x 3 neighbours on the surface of each answer of a row, and their total light.
+    """Write the number of 3 x 3 neighbours on the surface of each answer of a row, itself included, and their total
+    light.
 
     distance, light: copies `with_margin`; row: of these copies.
     """

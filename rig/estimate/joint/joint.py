@@ -140,7 +140,8 @@ class Joint:
         return MapWork(sweep, setting, tables, solver, self.used)
 
     def end(self, work: "MapWork") -> None:
-        """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep."""
+        """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep. Call it before
+        the map's solver makes another map. Raises what a failed lesson raised."""
         assert work.stripes is not None, "the map has been made"
         sweep, tables, stripes, model = work.sweep, work.tables, work.stripes, work.setting.model
         self._prior.leave(stripes, tables.grid)

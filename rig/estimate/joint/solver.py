@@ -73,7 +73,8 @@ class MapSolver:
 
     @property
     def places(self) -> Places:
-        """Places of the last map's stripes, with the light measured there. Call it only after a map."""
+        """Places of the last map's stripes, with the light measured there. Only after a map; the next one overwrites
+        them."""
         assert self._memory is not None, "a map has been estimated"
         return self._memory.places
 

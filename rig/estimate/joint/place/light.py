@@ -210,7 +210,8 @@ def score_places(
     """Fill score and known of rows first_row..last_row-1 for stripes at x_px.
 
     shares: (FRACTIONS, 2, EIGHT), share of the line in each of the TAPS pixels around the one that holds its centre,
-    and the derivative of the share with respect to the centre's position in px. around: of `fetch_counts`.
+    and the derivative of the share with respect to the centre's position in px. around: of `fetch_counts`. out: with
+    distance, and all that `weigh_light` fills.
     """
     window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
     side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)
