@@ -123,7 +123,7 @@ class CountVolume(FrameTally):
 
 
 class Counter(Protocol):
-    """Takes the frames of one sweep after the other. Results depend neither on threads nor on the size of blocks."""
+    """Takes the frames of one sweep after another. Results depend neither on threads nor on the size of blocks."""
 
     def reset(self) -> None:
         """Begin the next sweep."""

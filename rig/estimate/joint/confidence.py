@@ -357,7 +357,7 @@ def stripe_table(
     bright: Brightness, workers: RowWorkers,
 ) -> StripeTable:  # fmt: skip
     """The stripe table of a map. n_frames: (columns,); pairs: of `pairs_to_ask`; other arrays: (rows, columns). x_px is
-    NaN without data, and sd_px is set to NaN there."""
+    NaN where there is no answer, and sd_px is set to NaN there."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
     neighbours = new_neighbours(pairs)
 

@@ -255,9 +255,9 @@ LIGHT_SIGMAS = 1.5
 class SecondLight(NamedTuple):
     """Inputs of the search for second returns that depend on the model; made once per model by `second_light`.
 
-    state: without ambient light. still: float32, (rows x width) between LANES zeros at either end, the probability that
-    a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not be
-    used. place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either
+    state: without ambient light. still: float32, rows x width numbers with LANES zeros at either end, the probability
+    that a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not
+    be used. place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either
     side of a candidate over which its light is summed.
     """
 

@@ -223,7 +223,7 @@ def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, worke
 
 
 def path_bins(geometry: SweepGeometry) -> tuple[float, float]:
-    """First path inverse depth and bins per unit of it, with room for the margins outside the depth range."""
+    """First path inverse depth, in 1/m, and bins per 1/m, with room for the margins outside the depth range."""
     near_m, far_m = geometry.depth_range_m
     # Paths are longer than depths towards the picture's corners, by up to a third with usual fields of view.
     w_lo, w_hi = 0.6 / far_m, 1.15 / near_m

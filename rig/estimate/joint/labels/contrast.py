@@ -52,10 +52,10 @@ class Contrast(NamedTuple):
     """Settings of the contrast costs under one model.
 
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
-    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
-    which is -4/8 to 3/8 px off the middle of its pixel, towards near. First index: 0 from far to near, 1 from near to
-    far. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width: pixels of a sensor's
-    row; what is stored behind them is padding. units_per_nat: of cost.
+    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre.
+    First index: 0 for pixels from far to near, 1 from near to far. Second: the centre is -4/8 to 3/8 px off the middle
+    of its pixel, towards near. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width:
+    pixels of a sensor's row; what is stored behind them is padding. units_per_nat: of cost.
     """
 
     place: Int16
