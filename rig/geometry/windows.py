@@ -62,7 +62,8 @@ class SweepGeometry:
 
     def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
         """This geometry with the light of a sweep whose columns were taken at `commands` (columns,), with the command
-        moving at this velocity. Rays, windows and `others` stay as they are."""
+        moving at this velocity. Rays, windows and `others` stay as they are. Raises CalibrationError for commands
+        outside the calibration's."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
         return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)

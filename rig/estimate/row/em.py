@@ -85,7 +85,8 @@ class Expectation(NamedTuple):
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
-    """Rows and columns (n,) of at most `lines` pairs, spread in a fixed pattern over those with a search window."""
+    """Rows and columns, int32 (n,) each, of at most `lines` pairs, spread in a fixed pattern over those with a search
+    window."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
