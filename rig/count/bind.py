@@ -96,7 +96,8 @@ class SweepClock:
 
     @property
     def synchronised(self) -> bool:
-        """Whether the columns of this sweep's frames can be trusted; False if residual_columns is NaN."""
+        """Whether columns of the sweep's frames can be trusted: small residual (not NaN) and clock error, wrong_way and
+        unlit 0."""
         return (
             self.residual_columns <= MAX_RESIDUAL_COLUMNS
             and abs(self.clock_error) <= MAX_CLOCK_ERROR
@@ -174,7 +175,8 @@ class FrameBinder:
 
     def bind(self, block: FrameBlock) -> tuple[BoundFrames, list[SweepClock]]:
         """Sweep, column and bin of the block's frames, and the clocks of the sweeps that the block closes. Raises
-        ProtocolError as `_pass_over` does and DeviceFault as `BlankingSync.mark` does."""
+        ProtocolError if more than MOST_OUT_OF_TURN frames of a sweep name a wrong sweep, and DeviceFault as
+        `BlankingSync.mark` does."""
         header, n = block.header, block.n_frames
         if self._t0 is None:
             self._t0 = header.t0_ticks

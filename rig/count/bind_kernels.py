@@ -81,8 +81,8 @@ def walk(
 ) -> Any:
     """Place frames from index `at` on. Returns the index of the first that names a later sweep, or len(records).
 
-    carried: (1,) of `CARRIED`. edges: (2, enough) point and time of the present sweep's markers. The other arrays are
-    filled as in `BoundFrames`.
+    carried: (1,) of `CARRIED`. edges: (2, number of markers or more), point and time of the present sweep's markers.
+    The other arrays are filled as in `BoundFrames`.
     """
     now = carried[0]
     for i in range(at, len(records)):
@@ -123,7 +123,7 @@ def walk(
 def cover(
     bins: NDArray[np.int32], x0: NDArray[np.int32], used_px: int, column_x0: NDArray[np.int32], window: int
 ) -> tuple[int, int]:
-    """Take frames out of their bin if their used pixels do not cover all pixels that their column counts.
+    """Set the bin of lit frames to BIN_UNUSABLE if their used pixels do not cover all pixels that their column counts.
 
     x0: (n,) first of the `used_px` pixels of each frame. column_x0: (columns,) first of the `window` pixels of each
     column. Returns the numbers of frames left on columns and in the dark bin.

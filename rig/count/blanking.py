@@ -99,9 +99,11 @@ class PatternSearch:
         self._shares = np.round(shares * _GRAIN)
 
     def scores(self, ones: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Best score in each window of `ones` (n,), NaN if a frame is lost, and whether the pattern may lie in it.
+        """Best score in each window of `ones` (n,), NaN if one of its frames is lost, and whether the pattern may lie
+        in it.
 
-        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has."""
+        Both are (n - window + 1,). Raises ValueError for fewer frames than a window has.
+        """
         n = self.window
         windows = sliding_window_view(ones, n)
         mean, drift = windows.sum(axis=1) / n, windows @ self._time
@@ -122,8 +124,8 @@ class PatternSearch:
     def measure(self, ones: Array, first: int, place: float, radius: float) -> PatternFit | None:
         """The pattern within `radius` frames of `place`; None if it is not there.
 
-        ones: of frames `first`, first + 1, ... , NaN if missing. Returns None also if frames of `span` lie outside, or
-        too many are missing.
+        ones: of frames `first`, first + 1, ... , NaN if missing. place: of the first edge, in frames. None also if
+        frames of `span` lie outside `ones`, or too many are missing.
         """
         begin, end = self.span(place, radius)
         if begin < first or end > first + len(ones):
@@ -197,7 +199,7 @@ class MarkerLine:
     sd: list[float] = field(default_factory=list)
 
     def add(self, index: int, place: float, sd: float) -> None:
-        """Add one more scan marker."""
+        """Add one more scan marker; its standard deviation counts as LEAST_SD_FRAMES at least."""
         self.index.append(index)
         self.place.append(place)
         self.sd.append(max(sd, LEAST_SD_FRAMES))
@@ -229,10 +231,11 @@ ASIDE_PX = 64
 class SweepPlace:
     """Place of a sweep among the frames.
 
-    frame: the first one that counts. scan_frame: place of its scan marker, in frames. ratio: of the scanner's clock to
-    nominal, in the SPAD's time. patterns: number of patterns that these are fitted to. found: the sweep's own pattern;
-    None if the place is taken from the line through the others. residual_frames: distance of its pattern from the place
-    predicted by earlier ones, or that distance's standard deviation if larger; NaN without a pattern.
+    number: of the sweep, see `BlankingSync`. frame: the first one that counts. scan_frame: place of its scan marker, in
+    frames. ratio: of the scanner's clock to nominal, in the SPAD's time. patterns: number of patterns that scan_frame
+    and ratio are fitted to. found: the sweep's own pattern; None if the place is taken from the line through the
+    others. residual_frames: distance of its pattern from the place predicted by earlier ones, or that distance's
+    standard deviation if larger; NaN without a pattern.
     """
 
     number: int

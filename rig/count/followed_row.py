@@ -23,7 +23,7 @@ _LONG = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowedRow:
-    """A row of one sweep. counts: uint16 (bins, width), how often each pixel fired over the frames of a bin; 0 outside
+    """A row of one sweep. counts: uint16 (bins, width), number of the bin's frames in which each pixel fired; 0 outside
     windows. Bins are columns or, with several lines, places of the mirror."""
 
     row: int
@@ -31,8 +31,9 @@ class FollowedRow:
 
 
 class RowWish(NamedTuple):
-    """The wish to follow a row. wanted: called at the begin of each sweep; the row, or None. found: called with the row
-    of each sweep at its end, before the sweep's counts are used. Both are called on the counting thread."""
+    """The wish to follow a row. wanted: called at the beginning of each sweep; returns the row to follow, or None.
+    found: called at the end of each sweep with its row, if one was followed, before the sweep's counts are used. Both
+    are called on the counting thread."""
 
     wanted: Callable[[], int | None]
     found: Callable[[FollowedRow], None]
@@ -50,7 +51,7 @@ class RowFollower:
         self._followed: FollowedRow | None = None
 
     def reset(self) -> None:
-        """Begin the next sweep."""
+        """Begin the next sweep, and ask which row is wanted in it."""
         row = self._wish.wanted()
         self._followed = None if row is None else FollowedRow(row, np.zeros(self._shape, np.uint16))
         self._counter.reset()
@@ -58,7 +59,7 @@ class RowFollower:
     def add(
         self, bits: NDArray[np.uint8], bins: NDArray[np.int32], column: NDArray[np.float64], x0: NDArray[np.int32]
     ) -> None:
-        """Add frames as in `Counter`."""
+        """Add frames as in `Counter`. An error in counting the row is logged and ends the following for this sweep."""
         followed = self._followed
         if followed is not None and 0 <= followed.row < bits.shape[1]:
             try:
@@ -73,7 +74,7 @@ class RowFollower:
         self._counter.settle(under_way)
 
     def finish(self) -> FrameTally:
-        """The sweep as the other counter has counted it."""
+        """The sweep as the other counter has counted it. The followed row, if any, is handed over first."""
         if self._followed is not None:
             self._wish.found(self._followed)
             self._followed = None
@@ -85,7 +86,8 @@ def add_row(
 ) -> None:
     """Add one row of packed frames, bits (n, row bytes), to the counts (bins, width) of their bins (n,).
 
-    Bins below 0 are no columns. x0: (n,), first pixel of each frame's row, if it is shorter than the sensor's.
+    Frames with a bin below 0 are not counted. x0: (n,), first pixel of each frame's row, if it is shorter than the
+    sensor's.
     """
     if not len(bits):
         return

@@ -218,7 +218,8 @@ def add_runs(
     words: (all words,), with `row_words` per row. first_word: (n,), word of the sensor's row at which a frame's used
     pixels begin; they are `used_words` words. bins: (n,), -1 dark, -2 skip, else an index of columns_at (bins, lines),
     which holds the columns for which the frame is counted, one for every laser line; with no lines, lit frames are
-    skipped. x0: (columns,). Only rows first_row..last_row-1 are touched, so that threads may share the outputs.
+    skipped. x0: (columns,). counts: of a type wide enough for all frames, see `with_room`. Only rows
+    first_row..last_row-1 are touched, so that threads may share the outputs.
     """
     rows, width_words = dark.shape[0], (dark.shape[2] - LANES) * STEPS // WORD_PX
     window = counts.shape[2]

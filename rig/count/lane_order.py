@@ -25,19 +25,19 @@ PAD: Final = 8
 
 @numba.njit(cache=True, nogil=True)
 def padded_lanes(pixels: int) -> int:
-    """Number of lanes for a row of `pixels` pixels, in whole vectors."""
+    """Number of lanes for a row of `pixels` pixels, rounded up to whole vectors of LANES lanes."""
     return -(-pixels // (STEPS * LANES)) * LANES
 
 
 @numba.njit(forceinline=True)
 def pair_bytes(lanes: int) -> int:
-    """Bytes from one pair of a row of counts to the next."""
+    """Bytes from one pair to the next in a row of counts with `lanes` lanes."""
     return 2 * (lanes + 2 * PAD)
 
 
 @numba.njit(cache=True, nogil=True)
 def new_counts(rows: int, lanes: int) -> NDArray[np.uint8]:
-    """Rows of `lanes` lanes (rows, bytes), all zero."""
+    """Rows of counts with `lanes` lanes each, uint8 (rows, bytes), all zero."""
     return np.zeros((rows, PAIRS * pair_bytes(lanes)), np.uint8)
 
 
@@ -49,7 +49,7 @@ def place_of(x, lanes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def places_of(x: NDArray[np.int64], lanes: int) -> NDArray[np.int32]:
-    """Index of each of many pixels (n,) in a row of counts with `lanes` lanes."""
+    """Indices of the pixels x (n,) in a row of counts with `lanes` lanes, int32 (n,)."""
     places = np.empty(x.shape[0], np.int32)
     for i in range(x.shape[0]):
         places[i] = place_of(x[i], lanes)
@@ -73,7 +73,7 @@ def read_planes(
     """Write the counts of two rows of `window` pixels to n and to the row after it, from their bit planes.
 
     planes, n: addresses. first, second: bytes at which the rows begin; planes lie `plane_bytes` apart. n_planes: number
-    of planes, 1, 2, 4 or 8. lanes: as in `pair_bytes`. Reads 16 bytes at a time, whatever the window.
+    of planes, 1, 2, 4 or 8. lanes: as in `pair_bytes`. Reads 16 bytes at a time, possibly beyond the rows.
     """
     pair = pair_bytes(lanes)
     for v in range(0, lanes, LANES):
@@ -142,7 +142,7 @@ def read_counts(counts: NDArray[np.unsignedinteger], halved: int, n: int, lanes:
 
 @numba.njit(cache=True, nogil=True)
 def write_counts(n: NDArray[np.uint8], counts: NDArray[np.unsignedinteger]) -> None:
-    """Add the counts of row n to a row in pixel order (window,)."""
+    """Add the counts of n, a row in lane order, to `counts` (window,), a row in pixel order."""
     pair = n.shape[0] // PAIRS
     for i in range(counts.shape[0] // STEPS):
         for q in range(PAIRS):
@@ -166,7 +166,8 @@ def halve_counts(n: int, lanes: int, times: int) -> None:
 
 @numba.njit(forceinline=True)
 def sum_counts(n: int, lanes: int, sums: int) -> None:
-    """Add the counts of the row at address n to the bytes (PAIRS, lanes, 2) at address `sums`."""
+    """Add the counts of the row at address n to the bytes (PAIRS, lanes, 2) at address `sums`. Sums above 255 wrap
+    round."""
     for v in range(0, 2 * lanes, 2 * LANES):
         for q in range(PAIRS):
             at = 2 * q * lanes + v

@@ -238,7 +238,8 @@ def follow_lines(
     shared: NDArray[np.float64],
     noise: NDArray[np.float64],
 ) -> None:
-    """Add up the light that points have in common with their partners, over the distance from the expected place.
+    """Add the light that points have in common with their partners, by distance from the expected place, to the last
+    three arrays.
 
     lines to x_hi: as for `compare_lines`, with all partners. usual, weight: (rows, width), mean ones r per exposure of
     each pixel over the sweep and 1 / sqrt(r), with a least r; both 0 for unusable pixels. rows: (partner columns, 5),

@@ -1,22 +1,22 @@
 """Checks of a map's counts and answers by its own light. A correctly taken map should pass them, whatever the scene.
 
-They use up to 8192 points, or 512 if not all counts are kept. A point is a row and a column. Its partners are the next
-row in the same column, and the same row in four other columns, to which the laser line has moved by 6 to 64 px (less in
-a narrow sweep). A stripe appears at a point and all its partners, at places that the planes predict; noise does not.
-Point and partners each have a line of counts: those of the row in the column.
+The checks use up to 8192 points, or 512 if not all counts are kept. A point is a row and a column. Its partners are the
+next row in the same column, and the same row in four other columns, to which the laser line has moved by 6 to 64 px
+(less in a narrow sweep). A stripe appears at a point and all its partners, at places that the planes predict; noise
+does not. A point and its partners each have a line of counts: the counts of that row in that column.
 
 - Pixels of a row: neighbours receive similar light, so no other order of the pixels is smoother than the right one.
 - Rows: a stripe is at the same place on the next row.
 - Frames: those of one column show the stripe at one place, pixel by pixel, just as two rows do.
 - Columns: the stripe moves from column to column as the planes predict; so does all other light of the sweep, mainly
   haze.
-- Unusable pixels of the calibration, hot or dead, differ from those beside them. If pixels at the places of a turned
-  picture do so more, the frames are turned.
+- Unusable pixels of the calibration, hot or dead, differ from those beside them. If the pixels where a turned picture
+  would have them differ more, the frames are turned.
 - Answers of estimators that learn the light. An answer is one of some 150 places, so a confidence of 0.9 needs evidence
   of seven nats. Hardly more than 7 x 7 lines of counts contribute to it. So each contributes some 1/7 nat on average,
   which is light half a standard deviation above the background. The light at the answers must exceed the light behind
-  them by this much, on lines of counts that did not give the answers. In dense fog more lines contribute. There it is
-  enough if it exceeds it by 0.4 of the light that the estimator says it has found.
+  them by this much, on lines of counts that did not give the answers. In dense fog more lines contribute. There an
+  excess of 0.4 of the light that the estimator says it has found is enough.
 
 If the light does not suffice, the answers lose their confidence, and with them all answers at the same distances.
 
@@ -119,8 +119,9 @@ class Points(NamedTuple):
 class Unlit(NamedTuple):
     """Sure answers at equal distances, of which not even LEAST_SHARE of the claimed light was found.
 
-    near_px, far_px: smallest and largest distance, from the first searched pixel of the row on the side of near depths.
-    share: of the light that was found. row, column, x: the answer in the middle of the group.
+    near_px, far_px: smallest and largest distance from the row's `x_lo`, counted towards far depths: negative if near
+    depths lie on the right. share: ratio of the light found to the light claimed. row, column, x: the answer in the
+    middle of the group.
     """
 
     near_px: int
@@ -173,11 +174,14 @@ class MapChecks:
     def check(
         self, sweep: Any, intensity: NDArray[np.uint32], stripe: StripeTable
     ) -> tuple[tuple[str, ...], StripeTable]:
-        """Doubts about a map, at most one: a sentence that says what to look at; empty if nothing speaks against it.
-        Also the stripe table, in which answers without light have at most the share of light found as confidence.
+        """Doubts about a map, and its stripe table.
+
+        There is at most one doubt, a sentence that says what to look at; none if nothing speaks against the map. In the
+        table, confidence is limited where answers lack light: to the share of the claimed light that was found.
 
         sweep: a `CountVolume`, or a sweep with `checked`: the lines of counts of POINTS points and of their partners,
-        (lines, points, window). intensity: (rows, width). stripe: the estimator's answers, unfiltered.
+        (lines, points, window). intensity: (rows, width), counts summed over the columns. stripe: the estimator's
+        answers, unfiltered.
         """
         most = VOLUME_POINTS if isinstance(sweep, CountVolume) else POINTS
         if most not in self._points:

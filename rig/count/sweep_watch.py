@@ -1,15 +1,16 @@
-"""Order and time of a sweep's frames, which their counts no longer show: are they of one map, and of their columns?
+"""Checks that the frames of a sweep are of one map, and each of its column. Their counts no longer show this.
 
 - *Frames of one scene.* The line moves by a fraction of its width from frame to frame and from column to column, so a
   frame has more ones in common with the next one than with the next but one, and more with the next column than with
-  the next but one. It is the other way round if frames of two maps come by turns. A few hundred frames are compared,
-  spread over the map.
-- *Markers.* The plan says when the gate opens and closes after the scan marker. Its edges in the frames' records must
-  be there, or the markers are late, for example because the wrong edge of their pulses is taken.
-- *Light.* It begins and ends with the gate. If all pixels are late against the records of their frames, it does both
-  late. A scene that begins behind the first column changes only one of the two, and puts no light where the gate is
+  the next but one. It is the other way round if frames of two maps alternate. A few hundred frames are compared, spread
+  over the map.
+- *Markers.* The plan says how long after the scan marker the gate opens and closes. If the gate's edges in the frames'
+  records lie elsewhere, the markers are late, for example because the wrong edge of their pulses is taken.
+- *Light.* It begins and ends with the gate. If the pixels lag behind the records of their frames, it begins late and
+  ends late. A scene that begins behind the first column changes only its beginning, and puts no light where the gate is
   low.
-- *The first frames* of the first column must have light in common with those after them, or they are of another place.
+- *The first frames* of the first column must have light in common with those after them; otherwise the mirror was
+  elsewhere when they were taken.
 
 With too little light, or too few frames, a check says nothing. Standard deviations are estimated from the frames.
 """
@@ -91,12 +92,13 @@ LIGHT_LATE: Final = (
 
 
 class SweepWatch:
-    """Watches the frames of one sweep after the other.
+    """Watches the frames of one sweep after another.
 
-    exposures: frames per column. frames: lit ones of a map. gate: for each leg, when the gate opens and closes, in
-    frames since the mirror enters the first column; empty if frames have no marks. delay: of the light after the gate,
-    in frames, as far as it is known. exposed: share of a frame's period. whole: whether the frames are of the whole
-    sensor, so that their ones tell of light. every: one of so many sweeps is watched, the first one among them.
+    exposures: frames per column. frames: number of lit frames of a map. gate: for each leg, when the gate opens and
+    closes, in frames since the mirror enters the first column; empty if frames have no marks. delay: of the light after
+    the gate, in frames, as far as it is known. exposed: exposure as a share of a frame's period. whole: whether the
+    frames are of the whole sensor; only then do their ones show when light begins and ends. every: of each `every`
+    sweeps the first one is watched.
     """
 
     def __init__(
@@ -120,9 +122,12 @@ class SweepWatch:
         self, bits: NDArray[np.uint8], numbers: NDArray[np.int64], lit: Bools, x0: NDArray[np.int32],
         since: Float64 | None = None, marks: NDArray[Any] | None = None, leg: int = 0,
     ) -> None:  # fmt: skip
-        """Look at frames of the sweep: packed bits (n, rows, row bytes), and (n,) numbers, whether they are counted for
-        a column, first used pixels, middles of exposures in frames since the mirror entered the first column, and
-        marks. Frames come in order."""
+        """Look at n frames of the sweep, which come in order.
+
+        bits: packed, (n, rows, row bytes). The other arrays are (n,). numbers: of the frames. lit: whether they are
+        counted for a column. x0: first used pixels. since: middles of exposures in frames since the mirror entered the
+        first column. marks: of the records; None if there are none. leg: the sweep's, an index of `gate`.
+        """
         if self._sweeps % self._every:
             return
         if self._first is None and lit.any():
@@ -139,7 +144,7 @@ class SweepWatch:
                     self._seen.append((since[part], marks[part].astype(np.int64), ones))
 
     def finish(self, leg: int = 0) -> tuple[str, ...]:
-        """Doubts about the sweep, at most one; the next one begins. leg: the sweep's."""
+        """Doubts about the sweep: at most one sentence. The next sweep begins. leg: the sweep's, an index of `gate`."""
         skipped = self._sweeps % self._every
         self._sweeps += 1
         if skipped:

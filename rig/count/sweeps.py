@@ -47,8 +47,9 @@ class FrameCounts:
 class SweepAccount:
     """Account of a sweep, kept after its counts are dropped.
 
-    index: of its map. direction: +1 if the mirror command rose, -1 if it fell; column indices mean the same commands in
-    both directions. gaps: (first, last) numbers of frames lost or repeated. The others are as in `SweepClock`.
+    index: number of the sweep's map. direction: +1 if the mirror command rose, -1 if it fell; column indices mean the
+    same commands in both directions. gaps: (first, last) numbers of frames lost or repeated. The others are as in
+    `SweepClock`.
     """
 
     index: int
@@ -78,10 +79,10 @@ class SweepData(SweepAccount):
 
 @dataclass(frozen=True, slots=True)
 class FirstSweep:
-    """The first sweep of a start that is made into a map. Its number is 0, unless the frames are a part that was cut
-    from a recording.
+    """The first sweep of a start from which a map is made.
 
-    clock_ratio: as in `FrameBinder`. Frames of earlier sweeps are not counted.
+    sweep: its number, 0 unless the frames are a part that was cut from a recording. Frames of earlier sweeps are not
+    counted. clock_ratio: as in `FrameBinder`.
     """
 
     sweep: int = 0
@@ -89,8 +90,9 @@ class FirstSweep:
 
 
 class SweepAssembler:
-    """Turns the blocks of one start into `maps` sweeps, from `start` (None: sweep 0) on. The result does not depend on
-    how frames are grouped into blocks. gate_delay_s: of the light after the gate, as far as it is known."""
+    """Turns the blocks of one start into `maps` sweeps, from `start` (None: sweep 0) on. first_index: number of the
+    first map. The result does not depend on how frames are grouped into blocks. gate_delay_s: of the light after the
+    gate, as far as it is known."""
 
     def __init__(
         self, plan: ScanPlan, counter: Counter, maps: int, first_index: int = 0, start: FirstSweep | None = None,

@@ -87,8 +87,8 @@ class FrameTally:
     doubts: tuple[str, ...] = ()
 
     def intensity(self, workers: RowWorkers | None = None) -> NDArray[np.uint32]:
-        """Counts summed over the columns, (rows, width) uint32; only in subclasses that keep counts. workers: threads
-        that share the work."""
+        """Counts summed over the columns, (rows, width) uint32. workers: threads that share the work. Raises
+        NotImplementedError except in subclasses that keep counts."""
         raise NotImplementedError
 
     def bound_column(self) -> NDArray[np.float64]:
@@ -123,7 +123,7 @@ class CountVolume(FrameTally):
 
 
 class Counter(Protocol):
-    """Takes the frames of one sweep after the other. Results depend neither on threads nor on the size of blocks."""
+    """Takes the frames of one sweep after another. Results depend neither on threads nor on the size of blocks."""
 
     def reset(self) -> None:
         """Begin the next sweep."""
@@ -133,10 +133,10 @@ class Counter(Protocol):
     ) -> None:
         """Add packed frames `bits` (n, rows, row bytes) to `bins` (n,); `column` (n,): each frame's fractional column.
 
-        Row bytes are a multiple of 8. Bins are a column index, BIN_DARK or BIN_UNUSABLE; the frames of a column follow
-        one another. x0: (n,), first used pixel of each frame, a multiple of 64; if rows are shorter than the sensor's,
-        their first pixel. The used pixels of a frame on a column must contain that column's window. The frames may
-        still be read after this returns, see `settle`.
+        Row bytes are a multiple of 8. A bin is a column (with several lines, a place of the mirror), BIN_DARK or
+        BIN_UNUSABLE; the frames of a column follow one another. x0: (n,), first used pixel of each frame, a multiple of
+        64; if rows are shorter than the sensor's, their first pixel. The used pixels of a frame on a column must
+        contain that column's window. The frames may still be read after this returns, see `settle`.
         """
 
     def settle(self, under_way: int = 0) -> None:
@@ -168,7 +168,8 @@ class SweepTally:
         self._dark_frames = np.zeros(self._layout.padded_width, np.int32)
 
     def note(self, bins: NDArray[np.int32], column: NDArray[np.float64], first_word: NDArray[np.int32]) -> None:
-        """Record the frames of a block. first_word: (n,), word at which each one's used pixels begin."""
+        """Record the frames of a block; bins, column: as in `Counter.add`. first_word: (n,), word at which each frame's
+        used pixels begin."""
         lit = bins >= 0
         if lit.any():
             here, columns = bins[lit], self._layout.columns
@@ -196,7 +197,7 @@ class SweepTally:
 
 
 def with_room(counts: Counts, n_frames: NDArray[np.int32]) -> Counts:
-    """The counts in a type wide enough for columns of `n_frames` (columns,) frames without overflow."""
+    """`counts`, or a copy in a wider type if columns of `n_frames` (columns,) frames could overflow."""
     most = int(n_frames.max(initial=0))
     for wider in (np.uint16, np.uint32):
         if most <= np.iinfo(counts.dtype).max:
@@ -270,7 +271,8 @@ class LineCounter(SweepCounter):
         self.reset()
 
     def finish(self) -> CountVolume:
-        """The counts so far. A column has its mirror place's frames and their mean distance from the place's centre."""
+        """The counts so far. `n_frames` of a column is that of its mirror place; `column` is the column's index plus
+        the mean distance of these frames from the place's centre."""
         place, volume = self._grid.place, super().finish()
         column = np.arange(len(place)) + (volume.column - np.arange(self._grid.places))[place]
         return replace(volume, n_frames=volume.n_frames[place], column=column)

@@ -5,7 +5,7 @@ project follows).
 exponential background to the near side of the row and finds the pixel with the largest product of (count - background)
 and the drop of the level from the 8 px before it (nearer) to the 8 px behind it (farther). The answer of `edge` is the
 pixel of the largest count within 2 px of it. Counts are integers (columns, rows, window); answers are float32 (rows,
-columns), refined to sub-pixel positions with the two pixels beside. Neither estimator uses or learns a model.
+columns), refined to sub-pixel positions with the two pixels beside each. Neither estimator uses or learns a model.
 """
 
 from dataclasses import dataclass
@@ -49,10 +49,13 @@ def sub_pixel(weight: Float64, peak: int, length: int) -> float:
 def peak_confidence(weight: Float64, counts: Float64, k: float, peak: int, length: int) -> tuple[float, float]:
     """Probability that the true peak is within 1 px of `peak`, and the mean count more than 1 px away.
 
-    Model: one pixel fires at the peak's rate p_peak, all others at the mean rate p_rest of the pixels more than 1 px
-    away. Over k frames the log-likelihood ratio of 'stripe at x' to 'no stripe' (prior NO_STRIPE) is
-    weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest)). Half a count is added so that no rate
-    is 0 or 1. (0, 0) if the peak has no count.
+    The row is the first `length` pixels. Model: one pixel fires with the peak's probability p_peak, all others with the
+    mean probability p_rest of the pixels more than 1 px away. Over k frames the log-likelihood ratio of 'stripe at x'
+    to 'no stripe' (prior NO_STRIPE) is
+
+        weight[x] (logit p_peak - logit p_rest) + k log((1 - p_peak) / (1 - p_rest))
+
+    Half a count is added so that no probability is 0 or 1. (0, 0) if the peak has no count.
     """
     if counts[peak] <= 0.0:
         return 0.0, 0.0
@@ -111,7 +114,9 @@ def peak_rows(
 ) -> None:  # fmt: skip
     """Run `argmax` (with_edge False) or `edge` on rows first_row..last_row-1.
 
-    out: (5, rows, columns) as in StripeTable, left as it is where a column has no frames or a row no window."""
+    out: (5, rows, columns), the first five arrays of a StripeTable; left as it is where a column has no frames or a row
+    no window.
+    """
     window = counts.shape[2]
     n = np.empty(window + 2 * MARGIN_PX, np.float64)
     score = np.empty(window + 2 * MARGIN_PX, np.float64)

@@ -1,11 +1,11 @@
 """Estimator `likelihood`: maximum likelihood of 'haze, stripe, then less' on every row. The medium is learned.
 
 The likelihood itself: `rig.estimate.row.likelihood`; the search along a row: `rig.estimate.search.rows`; the model and
-how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.online_learning`; the
-confidence of an answer, from its neighbours: `rig.estimate.row.confidence`. The first map is counted completely and
-estimated twice, because pixels that the first estimate shows to lie behind the stripe tell the ambient light. Every
-later map is estimated with a model learned from earlier maps alone: column by column while its frames come in, or when
-it is complete if its columns have more than BYTE_EXPOSURES exposures.
+how it is learned: `rig.estimate.row.model`, `rig.estimate.row.em`, `rig.estimate.online_learning`; the confidence of an
+answer, from its neighbours: `rig.estimate.row.confidence`. The first map is counted completely and estimated twice,
+because the first estimate shows which pixels lie behind the stripe, and these show the ambient light. Every later map
+is estimated with a model learned from earlier maps alone: column by column while its frames come in, or when it is
+complete if its columns have more than BYTE_EXPOSURES exposures.
 """
 
 import numpy as np
@@ -53,7 +53,8 @@ class Likelihood:
         return _LikelihoodCounter(self, layout, geometry, self._workers)
 
     def estimate(self, sweep: CountVolume | SearchedSweep, geometry: SweepGeometry) -> StripeTable:
-        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep."""
+        """Stripe table of one sweep. Afterwards `model` is the state for the next sweep. Raises UsageError if `model`
+        was learned from a sweep of another size, and what a failed lesson raised."""
         if isinstance(sweep, SearchedSweep):
             assert self.model is not None, "a sweep is judged under a model"
             used, found = self.model, sweep.stripe

@@ -75,16 +75,18 @@ def _median_rows(disparity: Float32, confidence: Float32, coupled: bool, out: Fl
 
 
 def median_filter(stripes: StripeTable, reference_px: Float64, *, coupled: bool = False) -> StripeTable:
-    """Stripe table with x_px from the 5x5 median of its disparity, and with confidence and x_sd_px to match.
+    """Stripe table with x_px from the 5x5 median of its disparity, confidence and x_sd_px to match, and the other
+    arrays as they are.
 
     reference_px: (rows, columns), the position of the column's line at a fixed depth. Where it or x_px is NaN, the
     result is NaN and has confidence 0.
 
     The new confidence is a product. First factor: the share of the confidence in the 5x5 that belongs to answers within
-    1 px of the median. Second factor: the probability that these answers are right if each is independent evidence of
-    it, odds = odds of NEUTRAL x product of (odds of the answer / odds of NEUTRAL); if `coupled`, their mean confidence,
-    since answers that influence each other are no such evidence. x_sd_px becomes the standard deviation of a median of
-    these answers. Where there is none within 1 px, the confidence is 0 and x_sd_px the distance to the nearest.
+    1 px of the median. Second factor: the probability that these answers are right, each taken as independent evidence:
+    odds = odds of NEUTRAL x product of (odds of the answer / odds of NEUTRAL). If `coupled`, answers influence each
+    other and are no such evidence; then the factor is their mean confidence. x_sd_px becomes the standard deviation of
+    a median of these answers. Where no answer is within 1 px, the confidence is 0 and x_sd_px the distance to the
+    nearest answer.
     """
     reference = reference_px.astype(np.float32)
     out = np.full((3, *stripes.x_px.shape), np.nan, np.float32)

@@ -76,7 +76,8 @@ class LessonInput:
     """The part of a sweep that is used for learning.
 
     tally: of the sweep; intensity: as returned by the tally; quiet: ones and exposures of pixels behind clear stripes,
-    see `ambient_map`; lines: some counts. more: input of the estimator's own `learn_more`, see `OnlineLearner`.
+    see `ambient_map`; lines: counts of the rows and columns of `next_lattice`. more: input of the estimator's own
+    `learn_more`, see `OnlineLearner`.
     """
 
     tally: FrameTally
@@ -132,7 +133,8 @@ class OnlineLearner(Generic[Tables]):
         return self._made[1]
 
     def attend(self, stripes: StripeTable, used: RowModel, frames: int, see: Callable[[], LessonInput]) -> None:
-        """Take note of a map: begin a lesson from it if one is due, or take over the model of the last lesson.
+        """Take note of a map: begin a lesson from it if one is due, or take over the model of the last lesson when that
+        is due; wait for the lesson if it is not over.
 
         used: the model that the map was estimated with; frames: its lit frames; see: called if the map is used.
         Raises what a failed lesson raised.
@@ -167,7 +169,8 @@ class OnlineLearner(Generic[Tables]):
 
 
 def first_model(volume: CountVolume, geometry: SweepGeometry, workers: RowWorkers) -> RowModel:
-    """The model of a first sweep, learned twice: once stripes are found, pixels behind them show the ambient light."""
+    """The model of a first sweep, learned twice: at first without, then with the ambient light that pixels behind the
+    stripes show."""
     intensity = volume.intensity(workers)
     model = learn_first(volume, geometry, ambient_map(volume, intensity, geometry, None), workers)
     dark = volume.dark_counts is not None

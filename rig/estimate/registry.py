@@ -70,8 +70,8 @@ class Estimator(Protocol):
 class EstimatorKind:
     """The object that the entry point of an estimator of another package loads.
 
-    create: makes a fresh estimator that uses up to so many threads. Its answers must not depend on that number.
-    coupled: whether neighbouring rows or columns influence each other's answers.
+    create: makes a fresh estimator, given the number of threads that it may use. Its answers must not depend on that
+    number. coupled: whether neighbouring rows or columns influence each other's answers.
     """
 
     create: Callable[[int], Estimator]
@@ -97,7 +97,7 @@ class ManyMaps(Protocol):
         ...
 
     def solver(self) -> Any:
-        """Memory for one map at a time, which is made on the thread that calls `run`."""
+        """Memory for one map at a time. The map is made on the thread that calls `run`."""
         ...
 
     def may_begin(self, frames: int) -> bool:
@@ -106,7 +106,8 @@ class ManyMaps(Protocol):
         ...
 
     def begin(self, sweep: Any, geometry: "SweepGeometry", solver: Any) -> Work:
-        """Begin a map with a solver that no other map uses. Call the result's `run` on any thread, then `end`."""
+        """Begin a map with a solver that no other map uses until `end`. Call the result's `run` on any thread, then
+        `end`."""
         ...
 
     def end(self, work: Any) -> None:
@@ -122,9 +123,10 @@ class LearnsFromStream(Estimator, Protocol):
 
 
 def recalling(name: str, learned: Sequence[Learned], threads: int = 2, *, temporal_prior: bool = False) -> Estimator:
-    """An estimator that learns nothing and estimates each map with its own state, as `Recalled` does.
+    """An estimator that learns nothing and estimates each map with that map's own state, as `Recalled` does.
 
-    name: one of LEARNING, else KeyError. learned: at least one. temporal_prior: whether the maps were made with it.
+    name: one of LEARNING, else KeyError. learned: the maps' states, in order, at least one. temporal_prior: whether the
+    maps were made with it.
     """
     return (RecalledMaps if name == "joint" else Recalled)(
         _learning(name, threads, learns=False, temporal_prior=temporal_prior), learned
@@ -152,7 +154,8 @@ def create_estimator(
 def estimate_problems(
     estimator: str | None, filter: str | None, min_confidence: float | None, known: Sequence[str]
 ) -> list[str]:
-    """A line for each of these settings that cannot be; None is not given. known: the estimators that may be named."""
+    """A line for each of these settings that is not allowed. A setting that is None was not given and is no problem.
+    known: the estimators that may be named."""
     problems = []
     if estimator is not None and estimator not in known:
         problems.append(f"estimator {estimator!r} is unknown; choose one of {', '.join(known)}")
@@ -164,8 +167,8 @@ def estimate_problems(
 
 
 def is_coupled(name: str) -> bool:
-    """Whether neighbours influence each other's answers: that they agree is then no further evidence. Raises UsageError
-    as `create_estimator` does."""
+    """Whether neighbours influence each other's answers with this estimator. If so, their agreement is no further
+    evidence. Raises UsageError as `create_estimator` does."""
     return name in COUPLED if name in ESTIMATORS else _kind(name).coupled
 
 
@@ -192,8 +195,8 @@ def _learning(name: str, threads: int, *, learns: bool, temporal_prior: bool, ke
 
 
 class Recalled:
-    """Estimates each map with its own state, the next of `states` (at least one), and further maps with the last state.
-    of: an estimator of LEARNING that does not learn."""
+    """Estimates each map with that map's own state, the next of `states` (at least one), and further maps with the last
+    state. of: an estimator of LEARNING that does not learn."""
 
     def __init__(self, of: LearnsFromStream, states: Sequence[Learned]) -> None:
         self._states, self._of = list(states), of

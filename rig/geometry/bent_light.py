@@ -40,7 +40,7 @@ class BentLight:
     velocity_per_s: float = 0.0
 
     def inverse_depth(self, command: Float64, first_row: int = 0) -> Float32:
-        """Inverse depth, float32 (rows, width), of pixels seen at commands (rows, width); NaN where the command is NaN.
+        """Inverse depth in 1/m, float32 (rows, width), of pixels lit at `command` (rows, width), NaN where that is NaN.
         first_row: row of the picture to which the first row of `command` belongs."""
         from rig.geometry.kernels import bent_inverse_depth
 
@@ -73,9 +73,10 @@ def is_bent(model: RigModel) -> bool:
 
 
 def bent_u(model: RigModel, u: Float64, v: Float64, depth_m: float) -> Float64:
-    """The bent rays' u (rows, width): they meet the planes where, at this depth, true rays (u, v, 1) meet the sheets.
+    """The bent rays' u (rows, width). At this depth a bent ray meets a plane where the true ray meets the sheet.
 
-    The scanner's offset and cone are left out: they change less than the windows' margin. Without a bow, u itself.
+    u, v: of the true rays. The scanner's offset and cone are left out: they change less than the windows' margin.
+    Without a bow the result is u itself.
     """
     scanner = model.scanner
     if not isinstance(scanner, PivotScanner) or scanner.bow_per_rad == 0:
@@ -96,8 +97,8 @@ def beside_px(
     """Largest distance in pixels of true stripes from those that planes and bent rays give, within the depth range.
 
     rays: true u and v (rows, width). bent: u from `bent_u`. commands: (columns,). Rounded up, from a sample of rows and
-    columns. Holds for both directions up to the highest speed at which the lag was measured; if no speed is known, the
-    rows' delay is left out.
+    columns. The result holds for both directions of the sweep, up to the highest speed at which the lag was measured.
+    If no speed is known, the rows' delay is left out.
     """
     u, v, bent = (each[::_SAMPLED_ROWS] for each in (*rays, bent))
     y = np.arange(0, len(rays[0]), _SAMPLED_ROWS)[:, None]

@@ -1,9 +1,9 @@
 """Compiled geometry: the pixel interval of a depth range on a row, and the depth of pixels on bowed sheets.
 
 A pixel's ray is (u, v, 1); on a light plane p.X = 1 it has the inverse depth w = p.(u, v, 1) in 1/m. Along a row w is
-monotone, so `row_windows` finds both ends of an interval of w by bisection, int32 (rows,). `bent_inverse_depth` takes
-Newton's steps, starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64. u, v
-and inverse depth are float32 (rows, width).
+monotone, so `row_windows` finds both ends of an interval of w by bisection. `bent_inverse_depth` takes Newton's steps,
+starting from the plane, for the sheet of `calibration.model.light_sheet`; it computes in float64. u, v and inverse
+depth are float32 (rows, width).
 """
 
 from typing import Final
@@ -16,10 +16,10 @@ from rig.simd import Float32, Float64, Int32
 
 @numba.njit(cache=True, nogil=True)
 def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: float) -> tuple[Int32, Int32]:
-    """First and last pixel of each row whose inverse depth lies in [w_far, w_near], int32 (rows, columns) each.
+    """First and last pixel with inverse depth in [w_far, w_near], for each row and column: int32 (rows, columns) each.
 
     plane: p of each column, (columns, 3). Pixels at a row's ends without a ray (NaN) are outside. The interval is empty
-    (first > last) where the plane has no such pixel, and on rows with fewer than two rays.
+    (first > last) where no pixel of the row has such an inverse depth, and on rows with fewer than two rays.
     """
     rows, width = u.shape
     columns = plane.shape[0]
@@ -54,8 +54,8 @@ def row_windows(u: Float32, v: Float32, plane: Float64, w_far: float, w_near: fl
 
 @numba.njit(inline="always")
 def with_rays(u, y, first, last):  # type: ignore[no-untyped-def]
-    """The pixels `first` to `last` of row y without those at either end that have no ray (NaN): first and last of the
-    rest. At least one pixel is left, even if it has no ray."""
+    """First and last pixel with a ray (u is not NaN) among the pixels `first` to `last` of row y; both are `last` if
+    none of them has a ray."""
     while first < last and np.isnan(u[y, first]):
         first += 1
     while last > first and np.isnan(u[y, last]):

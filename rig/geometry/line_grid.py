@@ -1,9 +1,9 @@
 """Several lines at once: which column of the map each of them lights at every place of the mirror.
 
-A place is the piece of the mirror's path that it crosses during the frames of one column. A sweep has as many places as
-columns divided by lines. A frame taken at a place serves one column of each line, each with its own plane and window.
-Columns are numbered across the field in the direction of the mirror's sweep, as for a single line. Where the lines'
-parts of the field overlap, their columns interleave.
+A place is the piece of its path that the mirror crosses during the frames of one column. The number of places of a
+sweep is the number of columns divided by that of lines. A frame taken at a place serves one column of each line. Each
+of these columns has its own plane and window. Columns are numbered across the field in the direction of the mirror's
+sweep, as for a single line. Where the lines' parts of the field overlap, their columns interleave.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ class LineGrid:
         return columns
 
     def others(self, plane: Float64) -> Float64:
-        """Planes of the columns that are lit together with each column: (columns, lines - 1, 3); plane:
-        (columns, 3)."""
+        """Planes of the columns lit together with each column, (columns, lines - 1, 3). plane: (columns, 3), of all
+        columns."""
         together = self.columns_at()[self.place]
         own = together == np.arange(len(self.place))[:, None]
         result: Float64 = plane[together[~own].reshape(len(self.place), self.lines - 1)]
@@ -56,8 +56,8 @@ class LineGrid:
     def bound_commands(self, commands: Float64, column: Float64) -> Float64:
         """Mirror command plus offset of the column's line, (columns,), at which each column's frames were taken.
 
-        commands: the same at the columns' centres. column: (columns,), the fractional columns to which the frames were
-        bound. Their distances from the columns' own numbers are in places of the mirror.
+        commands: (columns,), command plus offset at each column's centre. column: (columns,), fractional column to
+        which each column's frames were bound; its distance from the column's own number counts places of the mirror.
         """
         result: Float64 = commands + (column - np.arange(len(commands))) * self.step
         return result
@@ -66,7 +66,8 @@ class LineGrid:
 def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float, float]) -> tuple[LineGrid, Float64]:
     """The grid of a map, and where each column lies: command of the mirror plus offset of the line, (columns,).
 
-    columns: number of columns, a multiple of the number of lines.
+    columns: number of columns, a multiple of the number of lines. command_range: mirror commands at which the sweep
+    begins and ends; they may fall.
     """
     lines = len(offsets)
     places = columns // lines
@@ -80,7 +81,7 @@ def line_grid(offsets: Sequence[float], columns: int, command_range: tuple[float
 
 
 def window_overlap(grid: LineGrid, geometry: SweepGeometry) -> float:
-    """Share of the pixels of all search windows that windows of other lines at the same place cover too; 0 if none."""
+    """Share of the pixels of all search windows that windows of other lines at the same place cover too, 0 to 1."""
     columns, covered, whole = grid.columns_at(), 0, 0
     for line in range(grid.lines):
         own, others = columns[:, line], np.delete(columns, line, axis=1)

@@ -1,4 +1,4 @@
-"""The stripe table: where the laser line was seen on every row and column, with what certainty, and its errors.
+"""The stripe table: where the laser line was seen on every row and column, and how certainly; errors of such tables.
 
 Arrays of stripes are (rows, columns). The errors are relative to a truth that a simulated world or a test knows.
 """
@@ -40,8 +40,10 @@ class StripeTable:
         return {name: value for name, value in values.items() if value is not None}
 
     def problem(self, rows: int, columns: int) -> str | None:
-        """A fault of the table of another package, in words: an array that is not float32 of shape (rows,
-        columns), or a confidence outside 0 to 1. None if there is none."""
+        """The first fault of a table that another package has made, in words; None if there is none.
+
+        A fault is an array that is not float32 of shape (rows, columns), or a value of `confidence` outside 0 to 1.
+        """
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         for name, value in values.items():
             if value is None and name in ("x2_px", "confidence2"):
@@ -56,7 +58,7 @@ class StripeTable:
 
     @classmethod
     def empty(cls, rows: int, columns: int) -> "StripeTable":
-        """A table without any estimate."""
+        """A table without any estimate: confidence 0, all else NaN, no second stripes (None)."""
         nan = [np.full((rows, columns), np.nan, np.float32) for _ in range(4)]
         return cls(nan[0], np.zeros((rows, columns), np.float32), nan[1], nan[2], nan[3])
 
@@ -66,10 +68,11 @@ MISSING_PX = 10.0
 
 
 def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
-    """Errors in pixels at each (row, column) with a true stripe; both arrays (rows, columns), NaN where there is none.
+    """Statistics of the errors in pixels over all (row, column) with a true stripe.
 
-    `missing`: share of true stripes without an estimate. `mean_abs`, `median_abs`: of those with an estimate; None if
-    there are none. `within_1px`: share of all; a missing one counts as wrong. All are None if there is no true stripe.
+    x_px, true_x_px: (rows, columns), NaN where there is none. `missing`: share of true stripes without an estimate.
+    `mean_abs`, `median_abs`: of those with an estimate; None if there are none. `within_1px`: share of all; a missing
+    one counts as wrong. All are None if there is no true stripe.
     """
     scored = np.isfinite(true_x_px)
     error = np.abs(x_px[scored].astype(np.float64) - true_x_px[scored])
@@ -81,8 +84,9 @@ def stripe_errors(x_px: Float32, true_x_px: Float32) -> dict[str, float | None]:
 
 
 def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
-    """Error of every (row, column) in pixels, NaN where there is no true stripe. Missing answers and larger errors
-    count as `MISSING_PX`.
+    """Absolute error of every (row, column) in pixels, NaN where there is no true stripe.
+
+    A missing answer counts as an error of `MISSING_PX`, and no error counts as more.
     """
     error = np.abs(x_px.astype(np.float64) - true_x_px)
     charged = np.where(np.isfinite(x_px), np.minimum(error, MISSING_PX), MISSING_PX)
@@ -90,7 +94,8 @@ def charged_errors(x_px: Float32, true_x_px: Float32) -> Float64:
 
 
 def depth_errors(depth_m: Float32, true_depth_m: Float32) -> dict[str, float | None]:
-    """Mean and median absolute depth error in metres over the pixels that have both depths; None if there are none."""
+    """`mean_abs` and `median_abs`: mean and median of the absolute depth errors in metres, over the pixels that have
+    both depths; None if there are no such pixels."""
     error = np.abs(depth_m.astype(np.float64) - true_depth_m)
     return _sizes(error[np.isfinite(error)])
 

@@ -37,8 +37,8 @@ class SweepGeometry:
     x0: int32 (columns,) first stored pixel; window: stored pixels per row, a multiple of 64.
     near_is_left: True if near points lie at smaller x than far ones (scanner on the left).
     depth_range_m: nearest and farthest depth. defects: bool (rows, width), True for pixels that must not be used.
-    others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each; None if
-    there is only one line. light: corrects depths that were computed from planes; None if not needed.
+    others: float64 (columns, lines - 1, 3), `plane` of the columns that other lines light together with each column;
+    None if there is only one line. light: gives the exact depths if the light is bent; None if it is not.
     """
 
     u: Float32
@@ -62,7 +62,8 @@ class SweepGeometry:
 
     def bound_to(self, model: RigModel, commands: Float64, velocity_per_s: float) -> "SweepGeometry":
         """This geometry with the light of a sweep whose columns were taken at `commands` (columns,), with the command
-        moving at this velocity. The windows stay."""
+        moving at this velocity. Rays, windows and `others` stay as they are. Raises CalibrationError for commands
+        outside the calibration's."""
         planes = model.planes(commands)
         light = None if self.light is None else replace(self.light, commands=commands, velocity_per_s=velocity_per_s)
         return replace(self, planes=planes, plane=planes[:, :3] / planes[:, 3:], light=light)
@@ -121,8 +122,8 @@ class SweepGeometry:
 def sweep_geometry(model: RigModel, commands: Float64, depth_range_m: tuple[float, float]) -> SweepGeometry:
     """Rays, planes and search windows of a sweep. commands: (columns,), of the mirror. depth_range_m: near and far end.
 
-    Raises UsageError if a plane passes through the camera, or if no column can be seen within the depth range, and
-    CalibrationError for commands outside the calibration's.
+    `others` is None, even with several lines. Raises UsageError if a plane passes within LEAST_OFFSET_M of the camera,
+    or if no column can be seen within the depth range, and CalibrationError for commands outside the calibration's.
     """
     from rig.geometry.kernels import row_windows
 

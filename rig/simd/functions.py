@@ -118,7 +118,7 @@ def lift_to_powers(best, shift):  # type: ignore[no-untyped-def]
 def powers(scores, lift, shift):  # type: ignore[no-untyped-def]
     """2^(score / units) of 16-bit lanes as float32, times a factor that depends only on `lift`.
 
-    lift: see `lift_to_powers`; scores below -lift give 0. The lanes are in the order UNPACKED of `rig.simd.vectors`.
+    lift: see `lift_to_powers`; scores of -lift or less give 0. Lanes are in the order UNPACKED of `rig.simd.vectors`.
     """
     return from_bfloat16_unpacked(larger(add_saturated(scores, lift), np.int16(0)) << shift)
 

@@ -26,7 +26,7 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def pointers(arrays: Arrays) -> Arrays:
-    """A copy of a named tuple for kernels, with each array replaced by its address, also in named tuples within it.
+    """A copy of a named tuple for kernels, with each array replaced by its address, also in nested named tuples.
 
     Arrays must be C-contiguous, and the caller must keep them alive.
     """
@@ -107,7 +107,7 @@ write_byte, write_int16, write_int32, write_int64, write_float32 = (_writer(kind
 
 @numba.njit(cache=True, nogil=True)
 def copy_floats(source: int, to: int, number: int) -> None:
-    """Copy `number` float32 from address `source` to address `to`, 16 at a time; numba copies slices one by one."""
+    """Copy `number` float32 from address `source` to address `to`, 16 at a time; numba copies them one by one."""
     whole = number - number % LANES
     for i in range(0, whole, LANES):
         store_float32(to, i, load_float32(source, i))

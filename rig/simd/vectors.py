@@ -31,7 +31,7 @@ VectorCode = tuple[_Signature, _Codegen]
 
 
 class Lanes(types.Type):
-    """Numba type of `count` integers of `bits` bits, or of as many float32."""
+    """Numba type of a vector of `count` integers of `bits` bits or, if `real`, of `count` float32."""
 
     def __init__(self, bits: int, *, real: bool = False, count: int = LANES) -> None:
         self.bits = bits

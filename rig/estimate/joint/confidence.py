@@ -14,9 +14,10 @@ Three things can be wrong with an answer, and each has its factor:
   noise of this mean; contrast' = max(contrast + 3, 1). The whole haze, because an answer can lie a little before the
   end of haze, and half of the haze would then be taken for light. hole: by how much contrast is below -FAR_BELOW, 30 at
   most.
-- odds: ratio of pairs of answers around that agree to those that do not (`agreement_row`). Odds count the more, the
-  more haze ends at the stripe, by the factor g = k / (k + SOME_HAZE) with k photons of it per pixel in all exposures.
-  In clear air only stripes give a margin; small things, whose surroundings do not agree, are as certain as others.
+- odds: ratio of pairs of answers around that agree to those that do not (`agreement_row`). The more haze ends at the
+  stripe, the more the odds count: by the factor g = k / (k + SOME_HAZE), with k photons of that haze per pixel in all
+  exposures. In clear air only stripes give a margin; small things, although their surroundings do not agree, are as
+  certain as others there.
 - missing: max(ln((1 + bright) / (1 + light)) - DARKER - CLEARLY max(contrast, 0), 0), with light: photons of the 3 x 3
   neighbours above the whole haze, in all exposures; bright: the same at the model's largest amplitude. If even a dark
   stripe would be visible, missing light means that there is no stripe. The contrast cannot show this.
@@ -69,7 +70,8 @@ _ANYWHERE: Final = np.float32(1e6)
 
 
 class Neighbours(NamedTuple):
-    """For each answer, the number of neighbours on its surface, and the number of pairs that could agree.
+    """For each answer, the number of neighbours on its surface, itself included, and the number of pairs that could
+    agree.
 
     number: int16 (rows, columns) with a margin of AROUND rows and LANES columns that holds 0. pairs: of `pairs_to_ask`.
     """
@@ -152,7 +154,8 @@ def agreement_row(number: Int16, y: int, line: Int16, out: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def apart_row(placed: Float32, row: int, out: Float32) -> None:
-    """Write the number of pairs of opposite neighbours whose mean is not within SAME_PX of the answer between them.
+    """Write, for each answer of a row, the number of pairs of opposite neighbours whose mean is not within SAME_PX of
+    it. A pair with a missing neighbour does not count.
 
     placed: a copy `with_margin` of final distances; row: of the copy.
     """
@@ -170,7 +173,8 @@ def apart_row(placed: Float32, row: int, out: Float32) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def light_row(distance: Float32, light: Float32, row: int, number: Float32, total: Float32) -> None:
-    """Write the number of 3 x 3 neighbours on the surface of each answer of a row, and their total light.
+    """Write the number of 3 x 3 neighbours on the surface of each answer of a row, itself included, and their total
+    light.
 
     distance, light: copies `with_margin`; row: of these copies.
     """
@@ -353,7 +357,7 @@ def stripe_table(
     bright: Brightness, workers: RowWorkers,
 ) -> StripeTable:  # fmt: skip
     """The stripe table of a map. n_frames: (columns,); pairs: of `pairs_to_ask`; other arrays: (rows, columns). x_px is
-    NaN without data, and sd_px is set to NaN there."""
+    NaN where there is no answer, and sd_px is set to NaN there."""
     confidence, signal, haze = (np.empty_like(x_px) for _ in range(3))
     neighbours = new_neighbours(pairs)
 

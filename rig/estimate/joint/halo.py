@@ -75,8 +75,8 @@ def add_equations(
     """Add the normal equations of lines first_line..last_line-1, weighted by the counts that the present state expects.
 
     Unknowns: haze in each profile bin; its share behind the stripe at each node; halo at each node and reach; offset of
-    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons;
-    hot_flux: pixels with more ambient light are left out. Only the lower triangle of the matrix is filled.
+    the ambient light. halo: (BINS, pixels) of `halo_shares`; light: of each line's stripe at its x_px, photons per
+    exposure; hot_flux: pixels with more ambient light are left out. Only the lower triangle of the matrix is filled.
     """
     bins, number = state.profile.shape[0], len(_REACHES)
     first_share, first_halo, last = bins, bins + HALO_NODES, matrix.shape[0] - 1
@@ -130,9 +130,9 @@ def add_equations(
 
 @numba.njit(cache=True, nogil=True)
 def solve(matrix: Float64, right: Float64, free: int) -> Float64:
-    """The x that minimises x' matrix x - 2 right' x, by coordinate descent.
+    """The x without negative elements that minimises x' matrix x - 2 right' x, by coordinate descent.
 
-    free: index of the only x that may be negative; -1 if none may.
+    free: index of an element that may be negative; -1 for none.
     """
     x, slope = np.zeros_like(right), -right
     for _ in range(MOST_SWEEPS):
@@ -263,7 +263,8 @@ _SIZE = _HALO + HALO_NODES * len(HALO_REACHES_PX) + 1
 
 
 class BrightLines(NamedTuple):
-    """Lines with a clear stripe of known light, from which a halo can be learned, and this light in photons."""
+    """Lines with a clear stripe of known light, from which a halo can be learned, and this light in photons per
+    exposure."""
 
     lines: Lines
     light: Float32
@@ -273,7 +274,8 @@ def bright_lines(
     volume: CountVolume, tables: JointTables, stripes: StripeTable, places: Places, workers: RowWorkers,
     number: int = DETECT_LINES,
 ) -> BrightLines:  # fmt: skip
-    """Lines whose stripe has a known light, out of up to `number` with a clear stripe, evenly spread over a map.
+    """Lines of known light, less than MOST_PEAK in a pixel, among up to `number` lines with a clear stripe spread
+    evenly over a map.
 
     tables: those that the map was made with; places: of its stripes.
     """
@@ -335,8 +337,9 @@ def learn_halo(
 ) -> RowModel:
     """The model with the halo that these stripes show, and the medium under it; without a halo if they show none.
 
-    With a halo, haze, extinction and ambient light change too. The scale of stripes is kept, since their light is based
-    on it. ambient: of each pixel, (rows, width), start value of the fit. dark: whether dark frames have measured it.
+    With a halo, haze, the level behind stripes, extinction and ambient light change too. The scale of stripes is kept,
+    since their light is based on it. ambient: of each pixel, (rows, width), start value of the fit. dark: whether dark
+    frames have measured it.
     """
     matrix, right = _equations(seen, geometry, replace(model, ambient=ambient), workers)
     free = -1 if dark else _SIZE - 1

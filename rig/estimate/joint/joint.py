@@ -9,7 +9,7 @@ model of the medium (`rig.estimate.joint.labels.contrast`). Costs are tied to th
 (`rig.estimate.joint.vote`). The answer of each row and column is then refined to a position between labels, with the
 help of neighbours on its surface (`rig.estimate.joint.place.place`), and gets a confidence
 (`rig.estimate.joint.confidence`). Each row is searched for a second stripe (`rig.estimate.joint.second_returns`). The
-model of light and medium is learned row by row first, as by `likelihood`, then from the map's own stripes.
+model of light and medium is first learned row by row, as `likelihood` does, then from the map's own stripes.
 """
 
 from dataclasses import dataclass, replace
@@ -58,7 +58,7 @@ next lesson may have many that agree on a wrong place."""
 
 
 class Joint:
-    """The row likelihood tied to the neighbours', with the state it has learned so far.
+    """The row likelihood tied to that of the neighbours, with the state that it has learned so far.
 
     Pass `model` to estimate a map again with the state that it was estimated with: the result is the same bit for bit.
     learns: whether later maps change that state. temporal_prior: whether the last map is a weak prior for the next.
@@ -100,7 +100,7 @@ class Joint:
     def counter(self, layout: SweepLayout, geometry: SweepGeometry) -> Counter:
         """A counter whose finished sweeps go to `estimate`. geometry: the nominal one, which holds for every sweep.
 
-        Raises UsageError if its maps would take too much memory, before any light is let out.
+        Raises UsageError if its maps would take too much memory.
         """
         grid_of(geometry)
         few = self._workers if self._workers.threads <= COUNTING_THREADS else RowWorkers(COUNTING_THREADS)
@@ -128,7 +128,10 @@ class Joint:
         return self._lessons.certain(frames)
 
     def begin(self, sweep: CountVolume, geometry: SweepGeometry, solver: MapSolver) -> "MapWork":
-        """Begin the map of a sweep, see `rig.estimate.registry.ManyMaps`."""
+        """Begin the map of a sweep, see `rig.estimate.registry.ManyMaps`. The first map's model is learned here.
+
+        Raises UsageError if the model was learned from a sweep of another size, or if maps would take too much memory.
+        """
         model = self._lessons.model_for(lambda: self._first_model(sweep, geometry))
         setting = LearningSetting(model, geometry, sweep.exposures, sweep.dark_counts is not None)
         tables = self._lessons.tables(setting, self._workers)
@@ -137,7 +140,8 @@ class Joint:
         return MapWork(sweep, setting, tables, solver, self.used)
 
     def end(self, work: "MapWork") -> None:
-        """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep."""
+        """Take note of a map that `run` has made: afterwards `model` is the state for the next sweep. Call it before
+        the map's solver makes another map. Raises what a failed lesson raised."""
         assert work.stripes is not None, "the map has been made"
         sweep, tables, stripes, model = work.sweep, work.tables, work.stripes, work.setting.model
         self._prior.leave(stripes, tables.grid)

@@ -78,7 +78,8 @@ def read_positions(
     x_far: Float64, n_frames: Int32, side: int, width: int, answer: LabelAnswers, first_row: int, last_row: int,
     x_px: Float32, distance: Float32,
 ) -> None:  # fmt: skip
-    """Fill x_px (rows, columns) from the answers' labels, and distance = x_px - x_far; NaN without data.
+    """Fill x_px (rows, columns) from the answers' labels, and distance = x_px - x_far; NaN where nothing is searched or
+    a column has no frames.
 
     An answer beyond the middle of the first or last of `width` pixels gets margin 0 in `answer`. A stripe outside the
     picture has no label and leaves the row dark. In a dark row the outermost label seems far better than all others.

@@ -255,9 +255,9 @@ LIGHT_SIGMAS = 1.5
 class SecondLight(NamedTuple):
     """Inputs of the search for second returns that depend on the model; made once per model by `second_light`.
 
-    state: without ambient light. still: float32, (rows x width) between LANES zeros at either end, the probability that
-    a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not be
-    used. place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either
+    state: without ambient light. still: float32, rows x width numbers with LANES zeros at either end, the probability
+    that a pixel stays dark under ambient light alone; LEFT_OUT for hot pixels (`hot_in_bands`) and those that must not
+    be used. place: of `line_places`. apart: px from a stripe within which light counts as its own. reach: px to either
     side of a candidate over which its light is summed.
     """
 
@@ -370,8 +370,8 @@ def find_specks(
     """Fill speck (rows, columns), whether answers of rows first_row..last_row-1 are specks before a lit surface.
 
     distance, distance2: of answer and second return from the far end in px, NaN where there is none; signal: of
-    `StripeTable`; ones, expected: of `SecondReturns`. The light is tested on the speck's own row, since the wall around
-    a small opaque thing is lit too. All float32 (rows, columns).
+    `StripeTable`; ones, expected: of `SecondReturns`. The light is tested on the speck's own row, since the surface
+    around a small opaque thing is lit too. Arrays are float32 (rows, columns), n_frames (columns,).
     """
     rows, columns = distance.shape
     for y in range(first_row, last_row):
@@ -407,7 +407,7 @@ def exchange(
 ) -> None:
     """Exchange both returns where rows first_row..last_row-1 have specks.
 
-    The answer gets the mean deviation, signal and haze of the answers around it on its new surface, and the smaller of
+    The answer gets the mean x_sd_px, signal and haze of the answers around it on its new surface, and the smaller of
     the second return's confidence and their mean confidence. table: the arrays of a `StripeTable`.
     """
     x_px, confidence, sd_px, signal, haze, x2_px, confidence2 = table

@@ -73,7 +73,8 @@ class MapSolver:
 
     @property
     def places(self) -> Places:
-        """Places of the last map's stripes, with the light measured there. Call it only after a map."""
+        """Places of the last map's stripes, with the light measured there. Only after a map; the next one overwrites
+        them."""
         assert self._memory is not None, "a map has been estimated"
         return self._memory.places
 
@@ -110,7 +111,7 @@ class MapSolver:
         return x_px
 
     def teaching(self, volume: CountVolume, tables: JointTables, stripes: StripeTable) -> StripeTable:
-        """The last map's stripe table with the trust of `fill_trust` in place of the confidence."""
+        """`stripes`, the last map's stripe table, with the trust of `fill_trust` in place of the confidence."""
         memory, trust = self._room(tables.grid), np.empty_like(stripes.confidence)
         self._workers.over(
             len(trust),

@@ -36,7 +36,7 @@ class TemporalPrior:
     """Memory of the last map for the next one. on: whether maps are kept.
 
     before: uint16 (2, rows, columns), the last map's labels and the largest cost added to others (0: no prior). None if
-    nothing is known, as after a map without confident answers and before the first map of a geometry.
+    nothing is known: before the first map of a geometry, and after a map without confident answers.
     """
 
     def __init__(self, on: bool) -> None:

@@ -4,13 +4,12 @@ Four paths carry evidence along rows and columns only. If few photons come back,
 whole and form streaks. So an answer is put to the vote if its margin, by which the next best position costs more, is
 below WEAK. Candidates are its own label and those of the four nearest neighbours; the winner is the one with the least
 
-    sum over 5 x 5 neighbours n of margin_n min(|label - label_n|, FAR),
+    sum over 5 x 5 neighbours n of margin_n min(|label - label_n|, FAR)
 
-unless its own cost, without the messages of neighbours, exceeds that of the old label by more than OBJECTION; then the
-old one stays.
-The new margin is the sum of the margins of neighbours within SAME of the label, less that of all others, divided by the
-number of neighbours (the answer included) and at least 0. So where streaks disagree, margins are small. The vote
-rounds labels to int16 and divides margins (uint8, in units of cost) by SHARE, so that sums fit 16 bits.
+But the old label stays if the winner's cost, without the messages of neighbours, exceeds that of the old label by more
+than OBJECTION. The new margin is the sum of the margins of neighbours within SAME of the label, less that of all
+others, divided by the number of neighbours (the answer included) and at least 0. So where streaks disagree, margins are
+small. The vote rounds labels to int16 and divides margins (uint8, in units of cost) by SHARE, so that sums fit 16 bits.
 """
 
 from typing import Final, NamedTuple

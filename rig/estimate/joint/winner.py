@@ -59,9 +59,9 @@ class AnswerSettings(NamedTuple):
 
     stripes: number of labels that are positions; labels from there on are padding. weights: w by the difference of a
     total from the least one, float32 (256,). powers: for each r, powers of the distance from the winner, 0 for labels
-    farther away than r, float32 (REACH + 1, TAPS, POWERS). reach: r by a number of TAPS bits, which are set for labels
-    around the winner that are excluded, uint8 (2^TAPS,). near: for a winner at MIDDLE, LARGEST for labels that are too
-    near to be its rivals, else 0, uint8 (VECTOR,).
+    farther away than r, float32 (REACH + 1, TAPS, POWERS). reach: r for each set of excluded labels around the winner,
+    a number of TAPS bits with those of excluded labels set, uint8 (2^TAPS,). near: for a winner at MIDDLE, LARGEST for
+    labels that are too near to be its rivals, else 0, uint8 (VECTOR,).
     """
 
     stripes: int

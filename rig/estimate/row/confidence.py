@@ -1,14 +1,14 @@
 """Confidence of `likelihood`: the probability that an answer lies within a pixel of a stripe, from its neighbours.
 
 A row alone cannot tell a dim stripe from a place where the haze merely ends, behind the edge of something nearer: the
-counts of both look alike. Its neighbours can: on a surface their answers agree, and their light adds up:
+counts of both look alike. The neighbouring answers can: on a surface they agree, and their light adds up:
 
     confidence = 1 / (1 + exp(A - B ln odds - C asinh contrast + D ln K))
 
-- odds: (agree - 1/2) / (others + 1/2). agree: number of answers on this answer's surface, up to REACH rows and columns
-  away, itself included: their distances from the position of the line at a fixed depth differ from its own by at most
-  SAME_PX. others: number of all other answers there. An answer without neighbours has odds 1. If ln odds is positive,
-  it is multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
+- odds: (agree - 1/2) / (others + 1/2). Of the answers up to REACH rows and columns away, itself included, agree is the
+  number that lie on this answer's surface, others the number of the rest. On one surface, distances from the position
+  of the line at a fixed depth differ by at most SAME_PX. An answer without neighbours has odds 1. If ln odds is
+  positive, it is multiplied by min(max(contrast / SEEN, 0), 1): without light, agreement is no evidence.
 - contrast: mean light of the answers that agree, above ambient light and half the haze, less SPARED pixels of haze,
   divided by the noise of this mean; at least LEAST. SPARED is for answers a little before the end of the haze, which
   take light of the haze for the stripe's.
@@ -102,7 +102,7 @@ def _judged(at, here, width, exposed, ambient, line_px):  # type: ignore[no-unty
 def believed(
     found: StripeTable, reference_px: Float32, exposures: Int32, ambient: float, line_px: int, workers: RowWorkers
 ) -> StripeTable:
-    """The stripe table `found` by the search, with confidences from neighbours and without negative signals.
+    """The stripe table `found` by the search, with confidences from neighbours and with negative signals set to 0.
 
     reference_px: (rows, columns), position of the line at a fixed depth; other arguments: see `confidences`.
     """

@@ -85,7 +85,8 @@ class Expectation(NamedTuple):
 
 
 def lattice(geometry: SweepGeometry, lines: int) -> tuple[Int32, Int32]:
-    """Rows and columns (n,) of at most `lines` pairs, spread in a fixed pattern over those with a search window."""
+    """Rows and columns, int32 (n,) each, of at most `lines` pairs, spread in a fixed pattern over those with a search
+    window."""
     y, c = np.nonzero(geometry.x_lo <= geometry.x_hi)
     pick = evenly_spread(len(y), lines)
     return y[pick].astype(np.int32), c[pick].astype(np.int32)
@@ -223,7 +224,7 @@ def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, worke
 
 
 def path_bins(geometry: SweepGeometry) -> tuple[float, float]:
-    """First path inverse depth and bins per unit of it, with room for the margins outside the depth range."""
+    """First path inverse depth, in 1/m, and bins per 1/m, with room for the margins outside the depth range."""
     near_m, far_m = geometry.depth_range_m
     # Paths are longer than depths towards the picture's corners, by up to a third with usual fields of view.
     w_lo, w_hi = 0.6 / far_m, 1.15 / near_m
@@ -419,12 +420,12 @@ def learn_rows(
 ) -> float:  # fmt: skip
     """Do the expectation step over some lines, and return the log evidence.
 
-    Rows that have no stripe with a probability of 0.5 or more add nothing to levels 0 to 11, rows_seen and
+    Rows in which 'no stripe' has a probability of 0.5 or more add nothing to levels 0 to 11, rows_seen and
     columns_seen. Added to levels (bins, LEVELS), in columns:
     - 0 to 3, of pixels before the stripe: ones, exposures, exposures times G (`rig.estimate.row.inputs`), exposures
       times ambient flux, all weighted by the probability that the pixel lies before the stripe;
-    - 4 to 7: the same of pixels behind the stripe, of rows more certain than CERTAIN, other lines' haze as ambient;
-    - 8 to 11: the same, unweighted, of pixels more than CLEAR_PX before the stripe of rows more certain than CLEAR;
+    - 4 to 7: the same for pixels behind the stripe, in rows more certain than CERTAIN; other lines' haze is ambient;
+    - 8 to 11: as 0 to 3, unweighted, for pixels more than CLEAR_PX before the stripe in rows more certain than CLEAR;
     - 12 and 13: stripes, and stripes if all positions were equally likely (see CUT).
     Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Added to
     amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe' (see CUT). Pixels with more ambient flux

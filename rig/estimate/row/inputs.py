@@ -296,8 +296,8 @@ def judge_line(
 ) -> tuple[int, int, int, int, float, float, float]:
     """Compute the posterior of line i and write it to `row`.
 
-    Returns the values of `row_fluxes` (length 0 also without exposures), then the probability of 'no stripe', the part
-    of the prior that lies beyond the picture's border, and the log evidence.
+    Returns the values of `row_fluxes` (the length is also 0 if there are no exposures), then the probability of 'no
+    stripe', the part of the prior that lies beyond the picture's border, and the log evidence.
     """
     c = lines.column[i]
     length, first, last, start = row_fluxes(sweep, state, row, lines.row[i], c)

@@ -170,8 +170,8 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
     """Weighted fit of an exponential to haze flux (bins,) with its variance (bins,). None if fewer than 4 bins are
     known or there is hardly any haze.
 
-    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and its
-    product with the path at the nearest bin at most at OPTICAL_DEPTH_MAX.
+    Gauss-Newton on amplitude and extinction. The extinction is kept between 0 and EXTINCTION_MAX_PER_M, and its product
+    with the path at the nearest bin at most OPTICAL_DEPTH_MAX.
     """
     used = np.isfinite(flux) & np.isfinite(variance) & (variance > 0)
     if used.sum() < 4:

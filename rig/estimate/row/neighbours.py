@@ -1,7 +1,7 @@
 """Copies of maps with a margin: compiled code can compare each answer with those around it without checking bounds.
 
 Answers are compared by their distance in px from the position of their column's line at a fixed depth: neighbours whose
-distances differ by at most SAME_PX count as on one surface. Arrays are float32 (rows, columns).
+distances differ by at most SAME_PX count as lying on one surface. Arrays are float32 (rows, columns).
 """
 
 from typing import Final

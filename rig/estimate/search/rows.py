@@ -73,8 +73,8 @@ class SearchTables(NamedTuple):
     entry in hot_at and hot_place; hot_at: int16, stored pixels whose counts are not used; hot_place: int32, their
     places in the counts of all rows of the picture. nominal: exposures for which the tables are made. faintest,
     brightest: photons of a stripe at scale 1. reach: px on either side of a stripe whose light is its own. shift:
-    scores have 128 >> shift units an octave; close_shift: the same for the close-up. most: whole exposures above
-    which counts are halved. quiet_step: one of this number of columns is used to learn the ambient light. flux: see
+    scores have 128 >> shift units an octave; close_shift: the same for the close-up. most: whole exposures above which
+    counts are halved. quiet_step: one column in `quiet_step` is used to learn the ambient light. flux: see
     `count_fluxes`.
     """
 
@@ -106,10 +106,11 @@ class RowAnswers(NamedTuple):
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
     of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, as many lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane. light:
-    int32, like quiet, ones of every pixel within the windows. The most recent ones of both are still in quiet_here and
-    light_here, uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept;
-    line_start: int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order.
+    (rows, the same number of lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane.
+    light: int32, like quiet, ones of every pixel within the windows. The most recent ones of both are still in
+    quiet_here and light_here, uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows
+    that are kept; line_start: int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in
+    order.
     """
 
     stripe: Float32
@@ -161,7 +162,7 @@ def pointers_of(judge: SearchTables, found: RowAnswers, memory: Uint8) -> Search
 def count_fluxes() -> Float32:
     """Photons per exposure estimated from n ones in k exposures, float32: log((k + 1/2) / (k - n + 1/2)).
 
-    Nearly unbiased, and finite also at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
+    Nearly unbiased, and finite even at n = k. Rows are k in steps of 1/EXPOSURE_PARTS; columns are n, up to one more
     than COUNT_LIMIT, since halved counts are rounded up.
     """
     parts, n = np.mgrid[: EXPOSURE_PARTS * (COUNT_LIMIT + 1), : COUNT_LIMIT + 2]

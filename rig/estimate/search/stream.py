@@ -81,7 +81,7 @@ def _move_window(by, row_words, n, planes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def carry_sums(desk: SearchPointers, x0: int, first_row: int, last_row: int) -> None:
-    """Add the 8-bit sums light_here and quiet_here to light and quiet, and clear them. x0: begin of their window."""
+    """Add the 8-bit sums light_here and quiet_here to light and quiet, and clear them. x0: their first pixel."""
     _carry(desk.found.light_here, desk.lanes, desk.found.light, desk.sum_lanes, x0 // STEPS, first_row, last_row)
     _carry(desk.found.quiet_here, desk.lanes, desk.found.quiet, desk.sum_lanes, x0 // STEPS, first_row, last_row)
 
@@ -156,8 +156,9 @@ def search_frames(
     """Count and judge a block; returns the column that is open after it.
 
     words: (all words,) of the block's frames; bins: (n,), column of each frame, negative ones are skipped; first_word:
-    (n,) of each frame's window; row_words: words of a row; end: whether the sweep ends here, so that no column stays
-    open; desk: with a thread's own memory; planes: see `new_planes`. Only chunks first_chunk..last_chunk-1 are touched.
+    (n,) of each frame's window; row_words: words of a row; open_column: the column that is open before it; end: whether
+    the sweep ends here, so that no column stays open; desk: with a thread's own memory; planes: see `new_planes`. Only
+    chunks first_chunk..last_chunk-1 are touched.
     """
     rows = desk.judge.rows
     frame = rows * row_words

@@ -231,7 +231,8 @@ class ScreenTable(NamedTuple):
 
     Addresses, in lane order: edge, tap as in `ScreenTables`, constant as in `Search`; in pixel order, float32 of the
     stored pixels: before, scale, ambient. Numbers: all_right, score if all pixels lie right of the stripe; all_left,
-    what is added to the sum of all lanes if all lie left. searched: whether there is any position to search.
+    number that is added to the sum of all lanes if all pixels lie left. searched: whether there is any position to
+    search.
     """
 
     edge: int

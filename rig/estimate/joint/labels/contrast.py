@@ -6,8 +6,8 @@ ones among the pixels BESIDE_PX to both sides in 2 ROWS + 1 rows,
     p = sum w_t n_t / K,    N = K / sum w_t^2
     score = N (p log(p / p0) + (1 - p) log((1 - p) / (1 - p0))) where p > p0, else 0,    in nats
 
-which is the log-likelihood ratio of p to p0 for N frames, the effective number with the weights of a matched filter.
-As in `rig.estimate.joint.labels.costs`,
+The score is the log-likelihood ratio of p to p0; N is the effective number of frames with these weights, those of a
+matched filter. As in `rig.estimate.joint.labels.costs`,
 
     cost(l) = units_per_nat (largest score of the row - score(l)),    uint8 (rows, columns, labels), <= COST_LIMIT
 
@@ -49,13 +49,13 @@ _AHEAD: Final = 2
 
 
 class Contrast(NamedTuple):
-    """Settings of these costs under one model.
+    """Settings of the contrast costs under one model.
 
     place: int16 (columns, rows, PLACES) of `places_of`. hot_start, hot_x: as in `LabelTables`, of pixels that take the
-    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre,
-    which is -4/8 to 3/8 px off the middle of its pixel, towards near. First index: 0 from far to near, 1 from near to
-    far. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width: pixels of a sensor's
-    row; what is stored behind them is padding. units_per_nat: of cost.
+    count of the pixel beside them. shares: float32 (2, FRACTIONS, taps) of the line in the pixels around its centre.
+    First index: 0 for pixels from far to near, 1 from near to far. Second: the centre is -4/8 to 3/8 px off the middle
+    of its pixel, towards near. frames: float32 (FRACTIONS,), N for one frame. side: 1 if near is left, else -1. width:
+    pixels of a sensor's row; what is stored behind them is padding. units_per_nat: of cost.
     """
 
     place: Int16
@@ -80,14 +80,14 @@ def contrast_of(costs: Costs, line_sigma_px: float, width: int) -> Contrast:
 
 
 def share_of(belief: float) -> int:
-    """Share of the model's costs in the mean with these costs, in 1 / WHOLE: a half if the model is fully believed."""
+    """Weight of the model's costs in their mean with the contrast costs, in 1 / WHOLE: a half under full belief."""
     return round(WHOLE * belief / (1.0 + belief))
 
 
 def cost_contrast(volume: CountVolume, contrast: Contrast, first: int, last: int, cost: Uint8, share: int) -> None:
-    """Replace the costs of rows first..last-1 by the weighted mean of them and of these costs.
+    """Replace the costs of rows first..last-1 by the weighted mean of these costs and the contrast costs.
 
-    share: weight of the former costs in 1 / WHOLE, 0 for these costs alone.
+    share: weight of the former costs in 1 / WHOLE; 0 for the contrast costs alone.
 
     cost: uint8 (rows, columns, labels) of all rows. EXCLUDED labels and columns without frames keep their costs.
     Threads may fill different rows at once.

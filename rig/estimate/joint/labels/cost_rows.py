@@ -94,7 +94,8 @@ def read_bytes(
     counts: int, begin: int, places: int, stored: tuple[int, int, int, int], side: int, pixels: int, times: int,
     b: Buffers, batch: int,
 ) -> None:  # fmt: skip
-    """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get any values.
+    """Fill n of `batch` rows from counts that are bytes, from far to near. Pixels that were not stored get arbitrary
+    values.
 
     counts: address of the first count; begin: index of the first row's first count. stored: x of a row's first stored
     pixel, stored pixels of a row, number of all counts, counts of a column. times: factor on counts.

@@ -89,15 +89,15 @@ class Costs:
     units_per_nat: float
 
     def room(self) -> CostRoom:
-        """Working memory for one thread, used for one band of rows after the other."""
+        """Working memory for one thread, used for one band of rows after another."""
         return room_for(self.tables, self.halo, self.grid.labels)
 
     def fill(self, volume: CountVolume, first: int, last: int, room: CostRoom, out: Uint8) -> None:
         """Write the costs of rows first..last-1 to out, uint8 (rows, columns, labels) of all rows.
 
-        All labels cost 0 in columns without frames and where nothing is searched. Call it best with 16 rows or more at
-        a time. Threads may fill different rows at once, each with its own working memory. room: `pointers` to this
-        memory, which the caller keeps alive.
+        All labels cost 0 in columns without frames and where nothing is searched. A call is fastest with 16 rows or
+        more at a time. Threads may fill different rows at once, each with its own working memory. room: `pointers` to
+        this memory, which the caller keeps alive.
         """
         fill_costs(
             volume.counts, volume.n_frames, volume.x0, self.place, self.tables.at, room, self.ways, first, last, out

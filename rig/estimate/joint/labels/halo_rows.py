@@ -43,8 +43,8 @@ _FULL: Final = 32768.0
 
 
 class HaloTables(NamedTuple):
-    """Tables of the halo. Blocks of pixels are counted from FIRST_PX on, and places of the stripe, which are BLOCK_PX
-    apart, from the far end of label 0's pixel on.
+    """Tables of the halo. Blocks of pixels are counted from FIRST_PX on. Places of the stripe are BLOCK_PX apart and
+    counted from the far end of label 0's pixel on.
 
     weight: int16 (bands, columns, blocks, lights, places), of the mean count of a block. constant: float32
     (bands, columns, lights, places), nats per exposure. ramp: int16 (phases, 3, LANES), interpolation weights of the

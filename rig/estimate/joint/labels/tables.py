@@ -54,7 +54,8 @@ _NEAR, _FAR = 0, 1
 class LabelTables(NamedTuple):
     """Tables of all bands and columns, see the module.
 
-    P: pixels of a row, V: vectors of pixels that hold labels, from pixel FAR_PX on. Phases: far and near half of each.
+    P: pixels of a row, V: vectors of pixels that hold labels, from pixel FAR_PX on. PHASES: the far and the near half
+    of a pixel.
 
     at: int32 (bands, columns, VARIANTS), index of the table, -1 if there is none.
     edge: int16 (tables, P), weight of a count behind the stripe. edge_sum: float32 (tables, P), nats per exposure if
@@ -108,10 +109,10 @@ def fill_tables(
 ) -> None:  # fmt: skip
     """Fill the tables of bands first_band..last_band-1.
 
-    state: without ambient light, which is in `ambient` (rows, width), for pixels that are not `hot`. light: (LIGHTS x
-    pairs,) photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8
-    to 3/8 px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat:
-    units of weight per nat; most: largest sum of the sizes of a position's weights.
+    state: without ambient light. ambient: (rows, width), used for pixels that are not `hot`. light: (LIGHTS x pairs,)
+    photons at unit scale. shares: (FRACTIONS, taps) of the line in the pixels around its centre, which is -4/8 to 3/8
+    px off the middle of its pixel. beside: (BINS,), share of the halo in a pixel 4 px from the stripe. per_nat: units
+    of weight per nat; most: largest sum of the sizes of a position's weights.
     """
     side = 1 if sweep.near_is_left else -1
     pixels = out.edge.shape[1]
@@ -310,14 +311,15 @@ class Fitted(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Working memory for BATCH rows, int16 (BATCH, n_row or the like) unless stated.
+    """Working memory for BATCH rows, int16 (BATCH, ...) unless stated otherwise.
 
     n: counts of pixels from far to near; sums: for each pixel, from SUMS_FROM on, the score if all farther pixels lie
     behind the stripe; score: of pixel and phase; top: the largest score in each lane of each row; in the end the first
     LANES hold that of each row. cost: uint8, from the first pixel's phase 0 on. For all rows: mask: uint8 (labels,),
     EXCLUDED or 0; constant: of positions, edge: of pixels, for each variant; through: intermediate sums for edge.
-    int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: that of each row of the
-    batch; fitted: its index in `Fitted`; shown: first label that the mask leaves, and the one after the last.
+    int32: table: number of each variant's table, from variant -1 on, -1 if there is none; here: number of the table of
+    each row of the batch; fitted: index of that table in `Fitted`; shown: first label that the mask leaves, and the one
+    after the last.
     """
 
     n: Int16

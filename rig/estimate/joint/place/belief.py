@@ -1,15 +1,15 @@
 """Belief in a learned medium: how well haze, ambient light and halo explain counts, compiled.
 
-The counts of a row are compared with the light that the model expects beside its stripe, in blocks of BLOCK_PX pixels,
-O ones where E are expected with the variance V (of binomial counts):
+The counts of a row are compared with the light that the model expects beside its stripe, in blocks of BLOCK_PX pixels.
+With O the ones counted in a block, E those expected, and V the variance of O (a binomial count):
 
     misfit = mean of (O - E)^2 / V                     1 if only chance is left
     error^2 = sum of ((O - E)^2 - V) / sum of E^2      relative error of the expected light
 
 In quasi-likelihood (Wedderburn 1974) a log-likelihood whose counts scatter `misfit` times as much as its model says is
 divided by `misfit`. So the belief is 1 / misfit, at most 1. With more exposures a wrong medium is wrong by more
-standard deviations, and is believed less. The lines compared are evenly spread over the map; few of them taught the
-halo.
+standard deviations, and is believed less. The lines compared are evenly spread over the map; few of them were used to
+learn the halo.
 """
 
 from typing import Final, NamedTuple
@@ -63,7 +63,8 @@ def add_misfit(
     lines: Lines, light: Float32, sweep: Sweep, state: RowState, halo: Float32, hot_flux: float, first_line: int,
     last_line: int, sums: Float64,
 ) -> None:  # fmt: skip
-    """Add to sums (4,) of the module, for lines first_line..last_line-1: (O - E)^2 / V, blocks, (O - E)^2 - V, E^2.
+    """Add to sums (4,), for the blocks of lines first_line..last_line-1: (O - E)^2 / V, 1, (O - E)^2 - V, E^2 (see the
+    module).
 
     Lines whose stripe saturates its pixels are left out: their light, and so their halo, is not known.
     """

@@ -14,9 +14,9 @@ D = 1 / (e^flux - 1) (`score_places`),
     slope = light d share / dx (and the step of haze at the centre),
     g = sum slope (n D - (K - n)),    h = sum K slope^2 D
 
-are the derivative of the log-likelihood by position (1/px) and the Fisher information on it (1/px^2). For a pixel
-that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no information.
-Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
+are the derivative of the log-likelihood with respect to position (1/px) and the Fisher information on it (1/px^2). For
+a pixel that is missing in the row or must not be used, so much ambient light is assumed that the pixel gives no
+information. Arrays are float32 (rows, columns), see `Places` (`rig.estimate.joint.place.places`).
 """
 
 from typing import Final
@@ -210,7 +210,8 @@ def score_places(
     """Fill score and known of rows first_row..last_row-1 for stripes at x_px.
 
     shares: (FRACTIONS, 2, EIGHT), share of the line in each of the TAPS pixels around the one that holds its centre,
-    and the derivative of the share with respect to the centre's position in px. around: of `fetch_counts`.
+    and the derivative of the share with respect to the centre's position in px. around: of `fetch_counts`. out: with
+    distance, and all that `weigh_light` fills.
     """
     window, (pixels, columns) = sweep.window, (state.ambient.shape[1], x_px.shape[1])
     side, half, one = 1 if sweep.near_is_left else -1, np.float32(0.5), np.float32(1.0)

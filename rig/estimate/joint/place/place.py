@@ -129,7 +129,8 @@ def weigh_light(
 def line_width(
     volume: CountVolume, sweep: Sweep, state: RowState, stripes: StripeTable, workers: RowWorkers
 ) -> float | None:
-    """Standard deviation of the line in px, from the light of clear stripes; None if there is too little of it."""
+    """Standard deviation of the line in px, from the light of clear stripes, limited to LINE_SIGMA_PX. None if there is
+    too little light."""
     sums = np.zeros((stripes.x_px.shape[0], 2))
     clear = stripes.x_px, stripes.x_sd_px, stripes.confidence, stripes.signal
     seen = volume.counts, volume.n_frames, sweep, state, *clear
@@ -142,7 +143,8 @@ def line_width(
 
 
 def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
-    """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of stripes behind each.
+    """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of the stripes that each
+    of them represents.
 
     trusted: (rows, columns), which stripes count; None for all. If none counts, the amplitudes are 1.
     """

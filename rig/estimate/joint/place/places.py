@@ -1,8 +1,8 @@
 """Sub-pixel placing of stripes by one step of Fisher scoring, pooled over neighbours on the same surface.
 
-The counts around each stripe n give the slope of the log-likelihood with the stripe's position (the score g) and the
-Fisher information h (`rig.estimate.joint.place.light`). Neighbours on one surface have the same distance d, in px, from
-the position at the far end of the depth range. The pooled value
+The counts around each stripe n give the slope of the log-likelihood with respect to the stripe's position (the score g)
+and the Fisher information h (`rig.estimate.joint.place.light`). Neighbours on one surface have the same distance d, in
+px, from the position at the far end of the depth range. The pooled value
 
     d = sum (h_n d_n + g_n) / sum h_n
 

@@ -5,8 +5,8 @@ stripe has its own set of them, so running sums cannot be used. Rows are process
 with a margin of NaN (`with_margin`), so that no bounds need checking. All arrays are float32 (rows, columns).
 
 Joining: on a plane of any slope, the mean of two places opposite each other is the place between them. So a stripe is
-joined with pairs of opposite neighbours, each already placed with its own neighbourhood, where their mean m agrees with
-its own place d: within SAME_PX, and within SIGMAS times the standard deviation expected for the difference,
+joined with pairs of opposite neighbours; all of them have been pooled before. A pair counts if its mean m agrees with
+the stripe's place d: within SAME_PX, and within SIGMAS times the standard deviation expected for the difference,
 
     d' = (d / s^2 + sum m / v) / (1 / s^2 + sum 1 / v),    v = (s1^2 + s2^2) / 4
 
@@ -109,7 +109,8 @@ def pool_amplitude(
 def pool_places(
     places: Places, reaches: tuple[int, ...], enough: float, first_row: int, last_row: int, moved: Float32, sd: Float32
 ) -> None:
-    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its new place, both at most 1 px.
+    """Fill moved, the shift of each stripe in x, and sd, the standard deviation of its new place, both at most 1 px in
+    size.
 
     reaches: of neighbourhoods, smallest first; the first with `enough` information (1/px^2) is taken, else the last.
     """

@@ -49,8 +49,8 @@ def lower_unshown(
 def add_shown(
     counts: Counts, x0: Int32, x_px: Float32, first_row: int, last_row: int, excess: Float32, variance: Float32
 ) -> None:
-    """Fill S - m B / b and its variance, see the module, of rows first_row..last_row-1; 0 where there is no answer or
-    no pixel beside it."""
+    """Write S - m B / b and its variance, see the module, of rows first_row..last_row-1, except where there is no
+    answer or no pixel beside it."""
     window = counts.shape[2]
     begin, end = BESIDE_PX
     # Column by column, as counts are stored.
