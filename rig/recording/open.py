@@ -153,7 +153,7 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Scan markers of the start up to each frame, int64 (n,): 16 bits of its record, extended with the header's 32."""
+    """Number of scan markers of the start up to each frame, int64 (n,): its record's 16 bits, extended by the header."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 

@@ -144,7 +144,7 @@ class Recording:
         return self._pool.submit(self._write, block, placed, offset)
 
     def holds(self, ring: BlockRing) -> int:
-        """Blocks of the ring that are written at a time."""
+        """Number of blocks of the ring that `write_from` holds at a time."""
         return max(1, min(WRITERS, ring.slots // 4))
 
     def write_from(self, reader: RingReader) -> None:

@@ -26,7 +26,8 @@ class Budget:
     time_s: float
 
     def frames(self, frame_s: float) -> int:
-        """Number of whole frames in the time, also if it is too short by a millionth of a frame because of rounding."""
+        """Number of whole frames in the time. A time that rounding made a millionth of a frame too short counts as
+        whole."""
         return math.floor(self.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 
@@ -81,9 +82,9 @@ class Apparatus(Protocol):
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
         pixel detects after each pulse.
 
-        The pulses have the mean power of the source, which is at the camera. Light from a distance r arrives 2 r / c
-        after the middle of its pulse has left. A gate switches the pixels on only while light from within the depth
-        range can arrive.
+        bin_s: width of a bin of the result in seconds. The pulses have the mean power of the source and leave from the
+        camera. Light from a distance r arrives 2 r / c after the middle of its pulse has left. A gate switches the
+        pixels on only while light from within the depth range can arrive.
         """
         ...
 
@@ -104,11 +105,13 @@ class MakesApparatus(World, Protocol):
         self, *, rows: NDArray[np.int64], columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
         seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
     ) -> Apparatus:  # fmt: skip
-        """Make an apparatus at time 0. Light transport is kept, so another one for the same rows and columns is quick.
+        """Make an apparatus at time 0. Light transport is kept, so another apparatus for the same rows and columns is
+        made quickly.
 
         rows: image rows to measure, ascending. columns: their number. command_range: first and last command of the
         mirror; as in a scan, column c is the line at the command first + (c + 0.5) (last - first) / columns. power_w:
-        mean power of the source. seed: of all random draws. depth_range_m: range for which the gate of pulses is open.
-        Raises ValueError for impossible values, and DeviceError for a scene that moves.
+        mean power of the source. rule: how the columns that are lit share it. seed: of all random draws. depth_range_m:
+        range for which the gate of pulses is open. spad_frame_s: see `Apparatus`. Raises ValueError for impossible
+        values, and DeviceError for a scene that moves.
         """
         ...

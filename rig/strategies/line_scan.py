@@ -6,7 +6,7 @@ fewer frames than columns, the line passes several columns within a frame, as wi
 of them are lit together. Several lines share the light. Each of them has fewer places to go to, so each place gets more
 frames.
 
-The conventional camera (`LineCamera`) takes an image for each place of the line, which stands still meanwhile. Each
+The conventional camera (`LineCamera`) takes an image for each place of the line. The line stands still meanwhile. Each
 pixel's median over all images is subtracted. On every row the brightest pixel is then refined to the centroid of the
 pixels beside it (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996). Noise is measured
 in the images themselves.
@@ -48,7 +48,8 @@ def shares(frames: int, places: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class LinePlaces:
-    """Places at which a line stands. of: place of each column, (columns,). commands: their middles, (places,)."""
+    """Places at which a line stands. of: number of the place of each column, (columns,). commands: mean command of the
+    columns of each place, (places,)."""
 
     of: NDArray[np.int64]
     commands: Float64
@@ -65,7 +66,8 @@ class LinePlaces:
 
 
 def places_of(commands: Float64, most: int) -> LinePlaces:
-    """At most `most` places. Each has the same number of neighbouring columns, except the last one."""
+    """Group columns into at most `most` places. Each has the same number of neighbouring columns; the last may have
+    fewer."""
     together = -(-len(commands) // most)
     of = np.arange(len(commands)) // together
     return LinePlaces(of, np.bincount(of, weights=commands) / np.bincount(of))
@@ -93,7 +95,7 @@ class LineScan:
 
     @property
     def sentence(self) -> str:
-        """One sentence that says what it does."""
+        """One sentence that says what the strategy does."""
         many = "a line" if self.lines == 1 else f"{self.lines} lines at once"
         filtered = "" if self.filter == "none" else " with a 5 x 5 median"
         return f"SPAD array and {many} of light, the stripe found by the estimator {self.estimator}{filtered}."

@@ -69,12 +69,13 @@ class ComparisonPlan:
 class StrategyRow:
     """One strategy in one scene and air, by one rule, within one time; means over all seeds.
 
-    air: a visibility, clear, rain or snow; None for the scene's own. mean_px, median_px, good, valid, confident_wrong:
-    as in `Score`; None if the strategy needs more time. `too_short` then says how much. spread_px: standard deviation
-    of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance at which
-    90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms: sensor time. energy_mj: energy of
-    the light. compute_s: computing time, simulation included. laser_class, laser_class_still: of the source while it
-    works, and if it stood still; None without a source, or if its light is not visible.
+    air: a visibility such as 20m, or clear, rain or snow; None for the scene's own. rule: see `Rule`. mean_px,
+    median_px, good, valid, confident_wrong: as in `Score`; None if the strategy needs more time. `too_short` then says
+    how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median depth error.
+    range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms:
+    sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included. laser_class,
+    laser_class_still: of the source while it works, and if it stood still; None without a source, or if its light is
+    not visible.
     """
 
     strategy: str
@@ -140,7 +141,7 @@ def run_comparison(
     asked: ComparisonPlan,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Measure with all strategies in this process and tabulate.
+    """Measure everything that is `asked` with all strategies, in this process, and tabulate.
 
     progress: called with the number of measurements done and the total.
 
@@ -178,7 +179,8 @@ def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan)
 def measure_once(
     config: Mapping[str, Any], place: Mapping[str, Any], way: str, rule: Rule, time_s: float, seeds: tuple[int, int]
 ) -> dict[str, Any]:
-    """One row of a comparison as a case: plain values, with the computing time apart."""
+    """One row of a comparison, for a case of `cases_of`: plain values, with the computing time apart. place: fields of
+    `Place`. way: name of the strategy. seeds: the first, and the last plus one."""
     row = _measured(open_scene(config, Place(**place)), find_strategy(way), rule, time_s, range(*seeds))
     content = asdict(row)
     compute_s = content.pop("compute_s")
@@ -188,7 +190,8 @@ def measure_once(
 def tabulate(
     ways: Sequence[Strategy], found: Sequence[Result | None], verdict: Literal["complete", "aborted"] = "complete"
 ) -> Comparison:
-    """Make the comparison of the results of `cases_of`; those that are missing are left out."""
+    """Make the comparison from the results of the cases of `cases_of`, in their order; missing ones (None) are left
+    out."""
     rows = tuple(
         StrategyRow(**{**row, "compute_s": compute_s})
         for result in found

@@ -64,7 +64,8 @@ def visibility_m(air: str | None) -> float | None:
 
 
 def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, folder: Path) -> Path:
-    """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if it cannot be read.
+    """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if the scene cannot be read
+    or names surfaces that are not there.
 
     air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: of the camera, for `ramp`.
     """

@@ -66,7 +66,8 @@ def spad_frames(apparatus: Apparatus, budget: Budget, weights: Sequence[float]) 
 
 
 def flux_of(counts: NDArray[np.uint32], frames: NDArray[np.int64]) -> tuple[Float64, Float64]:
-    """Photons per frame and their variance, float64 like counts. counts: (patterns, rows, width), at most frames."""
+    """Photons per frame and their variance, float64 like counts. counts: (patterns, rows, width), at most frames
+    (patterns,), else ValueError is raised."""
     k = frames[:, None, None].astype(np.float64)
     n = counts.astype(np.float64)
     if np.any(n > k):
@@ -81,7 +82,8 @@ def measured(
     """Show patterns (patterns, columns) and return what pixels saw. weights: shares of the SPAD's time, by pattern.
 
     A conventional camera exposes all patterns equally. If an exposure would saturate, it takes several shorter ones of
-    each pattern. A camera's variance is only that of rounding until `with_noise` has fitted it.
+    each pattern, whose levels are averaged. Raises `TooShort` if the budget is too short for all patterns. A camera's
+    variance is only that of rounding until `with_noise` has fitted it.
     """
     if camera == "spad":
         frames = spad_frames(apparatus, budget, weights)
