@@ -71,7 +71,8 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: of the SPAD to be played."""
+    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: of the SPAD that it stands
+    for."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
@@ -253,10 +254,10 @@ class SoakReport:
 
 
 def soak(request: SoakRequest | None = None, *, progress: Progress | None = None, **changes: Any) -> SoakReport:
-    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
+    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`). A stream that the
+    overload policy ends gives a report too.
 
-    request, changes: options, as a `SoakRequest` or by the names of its fields: `soak(seconds=10, window=True)`. A
-      stream that the overload policy ends gives a report too.
+    request, changes: options, as a `SoakRequest` or by the names of its fields: `soak(seconds=10, window=True)`.
     progress: called with frames done and frames planned.
 
     Raises UsageError for a request that cannot be met.

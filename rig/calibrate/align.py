@@ -6,8 +6,8 @@ over. It publishes what a scan publishes, so that the page of `rig view --live` 
 The width of the line (focus) is its full width at half maximum in pixels of the sensor. It comes from the
 autocorrelation of the counts along a row, averaged over many rows and columns. No line has to be found for that, so it
 works far out of focus and in little light: the noise of two pixels is independent, so it cancels at every lag but 0,
-which is not used, as do hot pixels. A line of Gaussian shape has an autocorrelation wider by the square root of 2. The
-pixel's own width is in it. Haze and saturation make the line seem wider.
+and lag 0 is not used. Hot pixels cancel too. A line of Gaussian shape has an autocorrelation wider by the square root
+of 2. The width includes the pixel's own. Haze and saturation make the line seem wider.
 """
 
 import math
@@ -65,8 +65,8 @@ class AlignFigures:
     sweeps: number of the sweep, from 1. power_w: of the laser; limit_w: the most that it may be given.
     focus_px: width of the line, None if none stands out; left_px, middle_px, right_px: in the thirds of the image.
     line_seen: share of rows and columns with a sure stripe. peak_rate: median rate at the brightest pixel of these
-    stripes; scan_peak_rate: the same, foreseen for the power of a scan; saturated_fraction: share of these stripes
-    whose brightest pixel is SATURATED or above. All three are None without a sure stripe.
+    stripes; scan_peak_rate: the rate expected there with the power of a scan; saturated_fraction: share of these
+    stripes whose brightest pixel has a rate of SATURATED or more. All three are None without a sure stripe.
     mean_rate: of all pixels. lost: frames lost so far.
     """
 
@@ -104,7 +104,7 @@ class AlignFigures:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The end of an alignment. last: the figures of its last sweep; None if there was no whole one."""
+    """Result of an alignment. name: of the config. last: figures of the last sweep; None if there was no whole one."""
 
     name: str
     last: AlignFigures | None
@@ -282,7 +282,7 @@ class LineLook:
 
 
 def row_rates(volume: CountVolume) -> Float64:
-    """Rates of detection along rows, float64 (n, width): MOST_PLACES columns and rows, spread evenly over the sweep."""
+    """Rates of detection along rows, float64 (n, width): up to MOST_PLACES columns and rows each, spread evenly."""
     columns, rows, window = volume.counts.shape
     some = np.linspace(0, columns - 1, min(columns, MOST_PLACES)).astype(int)
     at = np.linspace(0, rows - 1, min(rows, MOST_PLACES)).astype(int)

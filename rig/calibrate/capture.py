@@ -1,10 +1,10 @@
 """Takes one view of the board from a scan of it: the board's picture, its corners, and the passages of every sweep.
 
 `capture_view` scans a live rig, `capture_recorded` reads a recorded run. An existing calibration is not used in the
-scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command at the instant
-when the line's centre crosses a pixel: as sent, not corrected for lag. If a SPAD cannot send or keep whole frames fast
-enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag. Windows
-and lag do not change the passages, except that a line outside the windows is not seen.
+scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command, as sent and not
+corrected for lag, at the instant when the line's centre crosses a pixel. If a SPAD cannot send or keep whole frames
+fast enough, the windows of the existing calibration are used instead, and the plan then allows for its known lag.
+Neither changes the passages, except that a line outside the windows is not seen.
 
 Passages are kept for pixels spread evenly over the board, away from printed edges, or over the whole picture if no
 board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still accelerating
@@ -174,7 +174,8 @@ def scan_sweeps(
     out: OutFolder = None,
     prepared: tuple[ScanPlan, SpadTiming] | None = None,
 ) -> None:
-    """Scan only for the listeners and, with `out`, a recording. An interrupt is raised again once the rig is safe."""
+    """Scan only for the listeners and, with `out`, a recording. prepared: what `prepare` has returned, if it was called
+    before. An interrupt is raised again once the rig is safe."""
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)

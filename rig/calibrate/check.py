@@ -1,4 +1,4 @@
-"""`rig calibrate check`: judges a calibration by views of a flat board from which it was not made."""
+"""`rig calibrate check`: judges a calibration by views of a flat board that it was not made from."""
 
 import math
 from collections.abc import Sequence
@@ -45,7 +45,8 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by views of a flat board from which it was not made (`rig calibrate check`).
+    """Judge a calibration by views of a flat board that it was not made from (`rig calibrate check`). sources: rigs,
+    runs or folders of views.
 
     If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
 

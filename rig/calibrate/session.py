@@ -3,8 +3,8 @@
     views/000.npz ...  rig.json (the rig of the views)  board.yaml (their board)  calibration.yaml (+ .npy)  camera.yaml
     report.html  summary.json
 
-`Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. A session that was
-interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
+`Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. If a session was
+interrupted, or if its views gave no calibration, they are kept and can be a source for the next one. A view's file,
 `views/000.npz`, has all that a fit needs. It is written completely or not at all:
 
     format_version () int   name () str   picture (height, width) float32, if there is one

@@ -6,8 +6,8 @@ the frames show when the light does. A pattern generator, a long cable and a las
 their sum is seen, on the SPAD's clock. The line must be in the picture when the gate opens or closes.
 
 If the line is so bright that pixels saturate, a frame lit for part of its exposure looks lit for longer, and tells
-little about the time within it. Saturation shows in the pixels that fire in two successive frames. The motion of the
-line from frame to frame reduces their number; the frame after the next one shows by how much.
+little about the time within it. Saturation shows in the number of pixels that fire in two successive frames. The motion
+of the line from frame to frame reduces this number; the frame after the next one shows by how much.
 """
 
 import math
@@ -205,7 +205,8 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run; None without markers, as planned times then follow from the light."""
+    """Measure the gate's delay in a recorded run. None for a run without markers: its planned times follow from the
+    light."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None

@@ -117,9 +117,9 @@ def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
 class Continuity:
     """Gaps and problems between the blocks of a recording. A gap is (number of the start, first frame, last frame).
 
-    known: gaps that a repair found and noted; None if there was no repair. gaps: those that the recording tells of,
-    because the device lost the frames or a repair noted them as missing. missing: those that the recording does not
-    tell of. problems: one line each.
+    known: gaps that a repair found and noted; None if there was no repair.
+    gaps: those that the recording tells of, because the device lost the frames or a repair noted them as missing.
+    missing: those that the recording does not tell of. problems: one line each.
     """
 
     known: Collection[RunGap] | None
@@ -345,8 +345,8 @@ def sealed(payload_crcs: Iterable[int], before: int = 0) -> int:
 
 
 def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> str | None:
-    """A line if there are as many blocks as the manifest says, but not those of its seal; otherwise None. None too if
-    nothing can be said: without a seal, before the run's end, or with another number of blocks."""
+    """A line if there are as many blocks as the manifest says, but not those of its seal. Otherwise None, also without a
+    seal and before the run's end."""
     crcs, recording = list(payload_crcs), manifest.get("recording") or {}
     told = recording.get(FRAMES_SEAL)
     if told is None or manifest.get("verdict") == UNFINISHED or recording.get("blocks") != len(crcs):
@@ -390,7 +390,8 @@ def _other_blocks(recording: RunRecording, manifest: Mapping[str, Any]) -> str |
 
 
 def frames_never_told(recording: RunRecording, manifest: Mapping[str, Any]) -> int:
-    """Number of frames that a finished run recorded, in blocks of which neither index nor segments tell; 0 if unknown."""
+    """Number of frames that a finished run recorded, in blocks of which neither index nor segments tell; 0 if that is
+    unknown."""
     told, delivered = _told(manifest)
     if told is None or delivered is None or recording.problems or "cut" in manifest:
         return 0

@@ -153,7 +153,8 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Number of scan markers of the start up to each frame, int64 (n,): its record's 16 bits, extended by the header."""
+    """Number of scan markers of the start up to each frame, int64 (n,): the 16 bits of its record, extended by the
+    header."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 

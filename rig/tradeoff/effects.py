@@ -45,7 +45,7 @@ class ReportsEffects(World, Protocol):
         ...
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power."""
+        """Choose the simulated effects for columns of `exposures` frames, each exposed for `exposure_s`."""
         ...
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
@@ -66,7 +66,7 @@ class Effect:
     share: share of all detected photons.
     changed_decisions_bound: largest share of an estimator's answers that can differ without the effect, whatever the
       estimator; None if there is no bound.
-    cost_us_per_frame: of one thread; None if it is part of another effect.
+    cost_us_per_frame: computing time on one thread; None if it is part of another effect.
     stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with the effect than
       without it, and the standard error of this change; None if not known.
     basis: 'trial' if the change was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is

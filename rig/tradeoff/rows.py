@@ -186,14 +186,14 @@ _T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
 
 
 def repeats_interval(means: Sequence[float]) -> Interval:
-    """Interval of the mean of two or more independent means of absolute errors, so never below zero."""
+    """95 % interval of the mean of two or more independent means of absolute errors. It is cut off at 0."""
     half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
     middle = statistics.fmean(means)
     return max(0.0, middle - half), middle + half
 
 
 def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
-    """Interval of the mean error sum(sums) / sum(numbers).
+    """95 % interval of the mean error sum(sums) / sum(numbers).
 
     sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
     means of randomly drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).
