@@ -345,8 +345,8 @@ def sealed(payload_crcs: Iterable[int], before: int = 0) -> int:
 
 
 def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> str | None:
-    """A line if there are as many blocks as the manifest says, but not those of its seal. Otherwise None, also without a
-    seal and before the run's end."""
+    """A line if there are as many blocks as the manifest says, but not those of its seal. Otherwise None, as it is
+    without a seal and before the run's end."""
     crcs, recording = list(payload_crcs), manifest.get("recording") or {}
     told = recording.get(FRAMES_SEAL)
     if told is None or manifest.get("verdict") == UNFINISHED or recording.get("blocks") != len(crcs):
