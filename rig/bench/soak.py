@@ -71,8 +71,7 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: of the SPAD that it stands
-    for."""
+    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: that of the SPAD to imitate."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")

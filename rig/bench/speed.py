@@ -129,7 +129,7 @@ class SpeedRow:
 
 @dataclass(frozen=True, slots=True)
 class WorkingPoint:
-    """Whether an estimator keeps up with the sensor, including counting.
+    """Whether an estimator, with counting, keeps up with the sensor.
 
     maps_per_s: of COLUMNS columns; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
     """
@@ -146,7 +146,7 @@ class WorkingPoint:
         return self.maps_per_s >= self.needed_per_s
 
     def __str__(self) -> str:
-        """In words."""
+        """Say in words whether it keeps up."""
         at = f"at K = {self.exposures} with {self.estimator} on {self.threads} thread{'s' * (self.threads > 1)}"
         needed, possible = digits(self.needed_per_s), digits(self.maps_per_s)
         if self.keeps_up:
@@ -156,7 +156,7 @@ class WorkingPoint:
 
 @dataclass(frozen=True, slots=True)
 class SpeedReport:
-    """Findings of `rig bench`."""
+    """Findings of `rig bench`. seconds: time that it took."""
 
     machine: dict[str, Any]
     memory_read_gb_per_s: float

@@ -156,9 +156,10 @@ def align(
 
 
 def low_power_w(rig: OpenRig, asked: str | None) -> float:
-    """The laser's power for an alignment. asked: as text; None for LOW_POWER of its limit, or the least that it takes.
+    """The laser's power for an alignment. asked: text such as '2 mW'; None: LOW_POWER times its limit, or its least
+    power if that is more.
 
-    Raises UsageError for a power outside the laser's limits.
+    Raises UsageError for a text that is no power, and for a power outside the laser's limits.
     """
     limits = rig.laser.limits
     if asked is None:

@@ -273,8 +273,8 @@ class SpeedRotation:
     """Takes successive views at different speeds in turn (see the module)."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """exposures: numbers per column that take turns; empty: the config's. sees: whether a capture shows enough of
-        the line."""
+        """Begin the rotation. exposures: numbers per column that take turns; empty: the config's. sees: whether a
+        capture shows enough of the line."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell or (lambda line: None)

@@ -45,8 +45,11 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by views of a flat board that it was not made from (`rig calibrate check`). sources: rigs,
-    runs or folders of views.
+    """Judge a calibration by views of a flat board that it was not made from (`rig calibrate check`).
+
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `CheckRequest` or by the names of its fields.
+    ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
 
     If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
 

@@ -192,7 +192,7 @@ WORST_PRECISION: Final = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelResult:
-    """A map of the pixels and its verdict.
+    """A map of the pixels (`found`) and its verdict.
 
     drift: change since the older map `against`; None without one.
     leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames; 0 for a recorded run.

@@ -50,6 +50,10 @@ def calibrate_planes(
 ) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `PlanesRequest` or by the names of its fields.
+    ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
+
     The fit starts from the request's `calibration`, if there is one, and keeps its defects. Raises Degenerate, with
     notes on the causes, if the views give no model, CalibrationError if a file cannot be used or the line does not
     reach the distance `at`, UsageError for a wrong request.

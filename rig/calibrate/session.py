@@ -279,7 +279,8 @@ def told(view: View, refused: Degenerate | None) -> str:
 
 
 def true_model(live: RigConfig | None) -> RigModel | None:
-    """The true rig model, from a world that knows it; None for a real rig. Call it only after all estimates."""
+    """The true rig model, from a world that knows it; None for a real rig, or if its world does not know. Call it only
+    after all estimates."""
     if live is None or live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:

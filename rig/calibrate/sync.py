@@ -96,6 +96,9 @@ def calibrate_sync(
 ) -> CalibrationResult:
     """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`).
 
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `SyncRequest` or by the names of its fields. tell: gets a line on each view.
+
     The lags are put into a copy of the request's calibration, or else of the rig's own, if there is one. Raises
     Degenerate if they cannot be determined, CalibrationError for a bad calibration, UsageError for a wrong request.
     """

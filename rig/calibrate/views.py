@@ -122,7 +122,8 @@ def take_live(
 
 
 def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_] | None = None) -> None:
-    """Take the views that need no live rig. defects: (rows, width), pixels that are not used."""
+    """Take the views that need no live rig. defects: (rows, width), pixels that are not used. Raises UsageError for
+    views of another board or rig, and for files that cannot be read."""
     for note in sources.notes:
         session.say(note)
     for folder in sources.sessions:

@@ -54,10 +54,10 @@ _NOT_ITS_OWN: Final = "bring its own segments back, or let 'rig repair' take it 
 class SoundBlock:
     """A block with correct checksums. Only the checksum of the pixels may be missing (see `objection`).
 
-    entry: its index record. first_tick, last_tick: of its first and last frame; 0 if it has none. last_sweep: number of
-    scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose ticks do not rise; they
-    count as missing. payload_crc: as its trailer states it. objection: why the block cannot be what was recorded; None
-    if it can.
+    entry: its index record. first_tick, last_tick: clock ticks of its first and last frame; 0 if it has no frame.
+    last_sweep: number of scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose
+    ticks do not rise; they count as missing. payload_crc: as its trailer states it; 0 if it has none. objection: why
+    the block cannot be what was recorded; None if it can.
     """
 
     entry: bytes
@@ -90,7 +90,7 @@ Run = Sequence[SoundBlock]
 
 
 def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
-    """Find all sound blocks, in order of their places; returns also a line for each damaged piece."""
+    """Find all sound blocks, in order of their places; returns also a line for each damaged piece of a segment."""
     if sum(segment.size for segment in segments) < _STEP_BYTES:  # threads would take longer to start
         found = list(map(_check, segments))
     else:
@@ -129,7 +129,7 @@ class Continuity:
 
     @property
     def lost(self) -> int:
-        """Number of frames in the gaps, each counted once."""
+        """Number of frames in `gaps`, each counted once."""
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:

@@ -103,8 +103,8 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan with which the frames were taken, adapted to the calibration `model`, and the timing of the SPAD, which
-    is configured here.
+    """Return the plan with which the frames were taken, adapted to the calibration `model`. Configures the SPAD with
+    it, and returns the SPAD's timing too.
 
     Raises UsageError as `read_plan` does and for a calibration that does not fit the plan, DamagedRecordingError if the
     frames differ in size from the plan's, and DeviceError as `SpadArray.configure` does.
@@ -136,10 +136,10 @@ def _begun_with(run: Path) -> str | None:
 class ReplayFacts:
     """Facts about a recording for its replay, as `rig.scan.scan.LiveFacts` has them for a live scan.
 
-    maps: number of maps to take, None for all (ENDLESS in a loop). starts: those of the SPAD, one after the other.
-    learned: in a part cut from a recording, the state of the estimator for each of its maps; empty if the estimator is
-    to learn again. Raises UsageError if there is no whole map, or fewer than `maps` and no loop;
-    DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
+    maps: number of maps to take, None for all (ENDLESS in a loop). starts: yields the starts of the SPAD to be played,
+    without end if the replay loops. learned: in a part cut from a recording, the state of the estimator for each of its
+    maps; empty if the estimator is to learn again. Raises UsageError if there is no whole map, or fewer than `maps` and
+    no loop; DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
     """
 
     command = "replay"
@@ -172,7 +172,7 @@ class ReplayFacts:
 
     @property
     def report(self) -> PaceReport:
-        """Report on how late blocks came by the clock of the replay."""
+        """Report on how late blocks came, compared with the clock of the replay."""
         return self._spad.pace.report
 
     @property
@@ -225,8 +225,9 @@ class ReplayFacts:
 class RecordedStart:
     """One start of the SPAD in a recording.
 
-    begin: the sweep with which its whole maps begin. first_map: number of the first of these maps in the recording.
-    sweeps: how many whole maps. gone: frames at the start's ends that the manifest mentions but no block contains.
+    number: of the start. begin: the sweep with which its whole maps begin. first_map: number of the first of these maps
+    in the recording. sweeps: how many whole maps. gone: frames at the start's ends that the manifest mentions but no
+    block contains.
     """
 
     number: int

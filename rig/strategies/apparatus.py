@@ -72,10 +72,9 @@ class Apparatus(Protocol):
     def spots(
         self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int, brightness: float = 1.0
     ) -> NDArray[np.uint32]:
-        """Light single spots one after the other, each with the whole power for some frames of the SPAD. Returns
-        (spots, width), the counts of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,).
-        brightness: share of the power, above 0 and at most 1.
-        """
+        """Light single spots one after the other, each for some frames of the SPAD. Returns (spots, width), the counts
+        of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power,
+        above 0 and at most 1."""
         ...
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
@@ -92,7 +91,7 @@ class Apparatus(Protocol):
         """Take one image with each of two conventional cameras, in ambient light only: (2, rows, width).
 
         The second camera stands beside the first, as far left or right as the light source, and looks in the same
-        direction. Both are without the narrow filter.
+        direction. Neither has the narrow filter for the light of the source. exposure_s: at least `camera_frame_s`.
         """
         ...
 

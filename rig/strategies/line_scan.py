@@ -74,7 +74,8 @@ def places_of(commands: Float64, most: int) -> LinePlaces:
 
 
 def windowed(volume: NDArray[np.uint32], geometry: SweepGeometry, first: int) -> NDArray[np.uint32]:
-    """The search windows of images (n, rows, width) of columns `first` to `first + n - 1`: (n, rows, window)."""
+    """The search windows of images (n, rows, width) of columns `first` to `first + n - 1`: (n, rows, window), 0 beyond
+    the right edge."""
     x = geometry.x0[first : first + len(volume), None, None] + np.arange(geometry.window)
     beyond = max(0, int(x.max()) + 1 - volume.shape[2])
     padded = np.pad(volume, ((0, 0), (0, 0), (0, beyond))) if beyond else volume
@@ -176,7 +177,8 @@ class LineCamera:
     clear_px: float = 0.3
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time."""
+        """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time, but at
+        most one for each column."""
         most = budget.frames(apparatus.camera_frame_s)
         if most < LEAST_PLACES:
             raise TooShort(f"{self.name} needs {LEAST_PLACES * apparatus.camera_frame_s * 1e3:.3g} ms")
@@ -200,10 +202,11 @@ def peak_centroids(images: NDArray[np.uint16], geometry: SweepGeometry, full_sca
 
     The median of each pixel over all images is subtracted: it is ambient light and offset. The position is the centroid
     of the brightest pixel within the search window (the middle one, if several in a row are saturated) and CENTROID_PX
-    pixels on each side. The noise of a dark pixel is its median absolute deviation over the images. A bright pixel has
-    shot noise too, which is learned from the growth of the variance with brightness. Confidence is the probability that
-    noise has made no other pixel of the window so bright, and that no other place on the row is as bright. x_sd_px is
-    the error of the centroid because of noise, at least 0.05 px.
+    pixels on each side. The noise of a dark pixel is the standard deviation that follows from its median absolute
+    deviation over the images. A bright pixel has shot noise too: its brightness is added to the variance, as if a grey
+    level were a photon. Confidence is the probability that noise has made no other pixel of the window so bright, and
+    that no other place on the row is as bright. x_sd_px is the error of the centroid because of noise, at least 0.05
+    px.
     """
     columns, rows, width = images.shape
     dark = np.median(images, axis=0).astype(np.float32)

@@ -45,7 +45,8 @@ class ReportsEffects(World, Protocol):
         ...
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the simulated effects for columns of `exposures` frames, each exposed for `exposure_s`."""
+        """Choose the simulated effects for columns of `exposures` frames, each exposed for `exposure_s`, at
+        `power_w`."""
         ...
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
@@ -89,7 +90,7 @@ class SceneEffects:
     """The effects of a scene.
 
     planned_for: the largest values for which the choice of effects holds: power_w of all lines together, exposure_s of
-      a column's frames together, and exposures, the number of these frames.
+      a column's frames together, and exposures, the number of these frames, which may be one more than planned.
     changed_decisions_bound: largest share of an estimator's answers, 0 to 1, that all effects left out can
       change together.
     """

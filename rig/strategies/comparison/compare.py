@@ -52,8 +52,9 @@ class ComparisonPlan:
     """Scenes, air, times and rules of a comparison.
 
     scenes: bundled names, files or folders, by the names that they have in the table. airs: fog, rain, snow or clear
-    air; None for a scene's own. times_s: time of a measurement. rows: number of image rows, from the middle of the
-    picture. lux: ambient light; None for each scene's own.
+    air; None for a scene's own. times_s: time of a measurement. rules: how the columns that are lit share the light
+    (`rig.strategies.apparatus.Rule`). rows: number of image rows, from the middle of the picture. lux: ambient light;
+    None for each scene's own. seeds: one measurement with each.
     """
 
     scenes: Mapping[str, str]
@@ -69,13 +70,13 @@ class ComparisonPlan:
 class StrategyRow:
     """One strategy in one scene and air, by one rule, within one time; means over all seeds.
 
-    air: a visibility such as 20m, or clear, rain or snow; None for the scene's own. rule: see `Rule`. mean_px,
-    median_px, good, valid, confident_wrong: as in `Score`; None if the strategy needs more time. `too_short` then says
-    how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median depth error.
-    range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms:
-    sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included. laser_class,
-    laser_class_still: of the source while it works, and if it stood still; None without a source, or if its light is
-    not visible.
+    air: a visibility such as 20m, or clear, rain or snow; None for the scene's own. rule: as in `ComparisonPlan`.
+    mean_px, median_px, good, valid, confident_wrong: as in `Score`; None if the strategy needs more time. `too_short`
+    then says how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median
+    depth error. range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is
+    none. spent_ms: sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included.
+    laser_class, laser_class_still: of the source while it works, and if it stood still; None without a source, or if
+    its light is not visible.
     """
 
     strategy: str
@@ -293,7 +294,8 @@ class Reached:
         self._all += np.bincount(self._bin, minlength=len(self._all))
 
     def range_m(self) -> float | None:
-        """Largest depth in the farthest bin of which at least the share REACHED is good; None if there is none."""
+        """Largest depth in the farthest bin of which at least the share REACHED is good; None if there is none. Bins
+        with fewer than FEWEST pixels are left out."""
         counts = np.bincount(self._bin, minlength=len(self._all)) >= FEWEST
         far = np.flatnonzero(counts & (self._good >= REACHED * np.maximum(self._all, 1)))
         return float(self._true_m[self._bin == far[-1]].max()) if len(far) else None
