@@ -68,9 +68,9 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    moment_s: time of each row in each of the `rounds`; count_moment_s: of the rows `count`, which are fast.
-    latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of the frames of each window, and
-    for the plain read. map_rows, map_columns: size of the complete maps.
+    windows: in px. exposures: per column. moment_s: time of each row in each of the `rounds`; count_moment_s: of the
+    rows `count`, which are fast. latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of
+    the frames of each window, and for the plain read. map_rows, map_columns: size of the complete maps.
     """
 
     windows: tuple[int, ...] = WINDOWS

@@ -209,7 +209,7 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 def gate_delay(run: Path) -> GateDelay | None:
     """Measure the gate's delay in a recorded run. None for a run without markers: its planned times follow from the
-    light."""
+    light. Raises what `read_plan` does."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None

@@ -1,8 +1,8 @@
 """Prepares a recording to be played like a scan: its plan, and its starts of the SPAD (frames without a pause).
 
-Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start is
-played as one start. So a map is made from exactly the same frames in the same order, at any speed. Scanner, laser and
-sync source are played too, unless emulated or real ones take part.
+Frames are bound to columns by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and
+each start is played as one start. So a map is made from exactly the same frames in the same order, at any speed.
+Scanner, laser and sync source are played too, unless emulated or real ones take part.
 """
 
 import itertools

@@ -145,7 +145,7 @@ def best_match(
     left: Float32, evidence: Float32, independent: float, step_px: float, at: NDArray[np.int64] | None = None
 ) -> Matches:
     """The best hypothesis of each pixel. left, evidence: results of `match`. step_px: pixels of disparity between two
-    hypotheses. at: hypotheses (rows, width) that are judged instead of the best ones.
+    hypotheses. at: indices (rows, width) of the hypotheses that are judged instead of the best ones.
 
     A block over a depth edge matches the surface with more contrast, while its middle may lie on the other surface. So
     if confident answers within a block are more than `EDGE_PX` apart, the confidence is halved.

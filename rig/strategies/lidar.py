@@ -7,7 +7,7 @@ compute the depth of a pixel from the times of its photons:
   time of the very first photon is the answer. Further photons are not used, so the error does not fall with a longer
   measurement.
 - peak: the first photons of all pulses make a histogram. The answer is where its matched filter is largest.
-- Coates (J. Phys. E 1, 1968): as peak, after correction of the pile-up. Pile-up arises since a pixel, after its first
+- Coates (J. Phys. E 1, 1968): as peak, after correction of the pile-up. Pile-up arises because a pixel, after its first
   photon, is blind until the next pulse.
 - gamma (Satat, Tancik and Raskar, "Towards photography through realistic fog", ICCP 2018): light of the fog is fitted
   by a gamma distribution a t^b exp(-c t), and the peak is sought in the light that exceeds it. Light that is scattered
@@ -18,7 +18,8 @@ If a pulse gives F photons from the fog before a surface and S from the surface,
 detected comes from the surface with the probability exp(-F) (1 - exp(-S)) / (1 - exp(-F - S)).
 
 Confidence is the probability that the answer is within 2 % of the depth. It is the probability that the peak is a
-surface (`rig.strategies.photon_times`), times the probability that its error is small enough.
+surface (`rig.strategies.photon_times`, or `first_photons` for a first photon), times the probability that its error is
+small enough.
 """
 
 import math

@@ -104,7 +104,8 @@ class PassiveStereo:
 
 
 def depth_of_pair(pair: Float32, geometry: ColumnGeometry) -> Answer:
-    """Depth from two pictures (2, rows, width), for the pixels of the first camera."""
+    """Depth from two pictures (2, rows, width), for the pixels of the first camera. Raises UsageError as `rectified`
+    does."""
     how = rectified(geometry.model)
     rows = geometry.rows
     if how.maps is not None:

@@ -132,8 +132,9 @@ def scene_effects(
 def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
 
-    x_px: pixels (width,); total; and by name the part of each effect of light and dark counts, zeros for effects that
-    are off. The parts add up to the total. Raises UsageError for a row or column that does not exist.
+    Returns x_px: pixels (width,); total: photons of each; and by its name the part of each effect of light or dark
+    counts, zeros for an effect that is off. The parts add up to the total. Raises UsageError for a row or column that
+    does not exist.
     """
     if row is None or column is None:
         raise UsageError("the flux is that of one image row at one column of the scan; give both `row` and `column`")

@@ -134,8 +134,8 @@ def tabulate(
     found: Sequence[Result | None],
     verdict: Literal["complete", "aborted"] = "complete",
 ) -> Tradeoff:
-    """Make the trade-off from the results of the cases of `cases_of`. Trials with a missing result (None) are left
-    out."""
+    """Make the trade-off from the results of the cases of `cases_of`. Trials with a missing result (None) are left out.
+    Limits are added if they are asked for and the verdict is 'complete'."""
     rows: list[TradeoffRow] = []
     limits = SceneLimits(asked.exposures)
     for number, config in enumerate(trials.values()):

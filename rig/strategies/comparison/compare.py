@@ -1,7 +1,7 @@
 """Measures the same scenes with every strategy (a way to measure depth), and tabulates the results.
 
-Every measurement has the same camera, the same power of its source, the same ambient light and the same time. All are
-repeated with each seed, which decides counts and noise; surfaces, drops and hot pixels stay as they are. A row of the
+Every measurement has the same camera, the same power of its source, the same ambient light and the same time. Each is
+repeated with every seed. A seed decides counts and noise; surfaces, drops and hot pixels stay as they are. A row of the
 table is one strategy in one scene and air, with one rule and time.
 """
 

@@ -2,8 +2,8 @@
 
 A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall with random texture that recedes from
 1.2 to 14 m, so that every distance is there. The air that is asked for replaces fog, rain and snow of the scene. Fog of
-a visibility is always one of droplets that scatter light more than once, whatever fog the scene has. Ambient
-light is that of the scene; a scene without any gets that of the bundled scenes.
+a visibility is always one of droplets that scatter light more than once, whatever fog the scene has. Ambient light is
+that of the scene; a scene without any gets that of the bundled scenes.
 """
 
 import os

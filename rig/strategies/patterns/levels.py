@@ -6,8 +6,8 @@ if no frame or every frame fired). Grey levels of a conventional camera have the
 noise and gain are not known to a strategy. So alpha and beta are fitted to the differences between the levels and those
 expected of the decoded pattern.
 
-Every pattern lights about half of the columns, and so does a reference picture. So a lit column is equally bright in
-all of them, whatever the rule by which the columns share the power.
+Every pattern lights about half of the columns. So a lit column is equally bright in all of them, whatever the rule by
+which the columns share the power.
 """
 
 from collections.abc import Sequence
@@ -120,7 +120,8 @@ def _exposure(apparatus: Apparatus, patterns: Float32, budget: Budget) -> tuple[
 
 
 def with_noise(levels: Levels, camera: Camera, expected: Float64, free: int) -> tuple[Levels, Float64]:
-    """Levels with the fitted noise of a camera, and how many times larger the variance is than noise explains.
+    """Levels with the fitted noise of a camera (those of a SPAD as they are), and how many times larger the variance is
+    than noise explains.
 
     expected: light (patterns, rows, width) that the decoded pattern would give. free: number of parameters that were
     fitted for it in each pixel, less than the number of patterns. The second result is float64 (rows, width), at least
