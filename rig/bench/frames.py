@@ -200,7 +200,8 @@ PATCH = 16
 class BenchSurface:
     """A surface that a whole sweep sees.
 
-    place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same shape.
+    place_px: float32 (columns, rows), the stripe's place in its window; photons: photons of the stripe per exposure, of
+    the same shape.
     """
 
     place_px: NDArray[np.float32]

@@ -68,9 +68,10 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    windows: in px. exposures: per column. moment_s: time of each row in each of the `rounds`; count_moment_s: of the
-    rows `count`, which are fast. latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of
-    the frames of each window, and for the plain read. map_rows, map_columns: size of the complete maps.
+    windows: widths in px. exposures: numbers per column. moment_s: time of each row in each of the `rounds`;
+    count_moment_s: the same for the rows `count`, which are fast. latency_s: length of the stream for the latency.
+    frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows, map_columns: size
+    of the complete maps.
     """
 
     windows: tuple[int, ...] = WINDOWS
@@ -107,9 +108,9 @@ class SpeedRow:
     """A row of the table. exposures: None for stages without columns. Numbers without a meaning for a stage are None.
 
     of_memory_bandwidth: bytes of frames read a second, divided by the memory's bandwidth. times_numpy: speed divided by
-    that of the row `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map
-    divided by that of a StereoSGBM map on as many threads, measured alternately. The error fields are those of
-    `StripeError`.
+    that of the row `numpy`. ms_per_map: time of a map, of stages that make complete ones. times_sgbm: for `joint`, the
+    time of a map divided by that of a StereoSGBM map on as many threads, measured alternately. The error fields are
+    those of `StripeError`.
     """
 
     stage: str
@@ -131,7 +132,7 @@ class SpeedRow:
 class WorkingPoint:
     """Whether an estimator, with counting, keeps up with the sensor.
 
-    maps_per_s: of COLUMNS columns; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
+    maps_per_s: possible maps of COLUMNS columns a second; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
     """
 
     estimator: str

@@ -62,12 +62,12 @@ SURELY_SD: Final = 8.0
 class AlignFigures:
     """The figures of a sweep. Rates are detections per exposure of a pixel.
 
-    sweeps: number of the sweep, from 1. power_w: of the laser; limit_w: the most that it may be given.
-    focus_px: width of the line, None if none stands out; left_px, middle_px, right_px: in the thirds of the image.
-    line_seen: share of rows and columns with a sure stripe. peak_rate: median rate at the brightest pixel of these
-    stripes; scan_peak_rate: the rate expected there with the power of a scan; saturated_fraction: share of these
+    sweeps: number of the sweep, from 1. power_w: power of the laser; limit_w: its largest allowed power.
+    focus_px: width of the line, None if none stands out; left_px, middle_px, right_px: its width in each third of the
+    image. line_seen: share of rows and columns with a sure stripe. peak_rate: median rate at the brightest pixel of
+    these stripes; scan_peak_rate: the rate expected there with the power of a scan; saturated_fraction: share of these
     stripes whose brightest pixel has a rate of SATURATED or more. All three are None without a sure stripe.
-    mean_rate: of all pixels. lost: frames lost so far.
+    mean_rate: mean over all pixels. lost: number of frames lost so far.
     """
 
     sweeps: int
@@ -104,7 +104,8 @@ class AlignFigures:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Result of an alignment. name: of the config. last: figures of the last sweep; None if there was no whole one."""
+    """Result of an alignment. name: name of the config. last: figures of the last sweep; None if there was no whole
+    one."""
 
     name: str
     last: AlignFigures | None
@@ -227,9 +228,10 @@ def _aligned(
 class LineLook:
     """The line in the counts of one sweep.
 
-    sweep: its number, from 1. widths_px: of the line in the whole image and in its thirds, None where none stands out.
-    line_seen, mean_rate: as in `AlignFigures`. peak_rates: float64 (n,), of the sure stripes' brightest pixels.
-    profile: float64 (width,), detections per exposure and pixel at each x, mean over the sweep and the rows.
+    sweep: its number, from 1. widths_px: widths of the line in the whole image and in its thirds, None where none
+    stands out. line_seen, mean_rate: as in `AlignFigures`. peak_rates: float64 (n,), rates of the sure stripes'
+    brightest pixels. profile: float64 (width,), detections per exposure and pixel at each x, mean over the sweep and
+    the rows.
     """
 
     sweep: int

@@ -82,8 +82,8 @@ def capture_view(
     """Scan once, in both directions, and take the view.
 
     board: None if there is none; passages are then kept over the whole picture.
-    seed: of everything simulated.
-    exposures: per column; None: the config's.
+    seed: decides all random draws of a simulation.
+    exposures: number of exposures per column; None: the config's.
     arm: must be True if laser or gate are real.
     defects: (rows, width), pixels that are not used.
     out: folder to record the scan into; None writes nothing.

@@ -182,7 +182,7 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
 
 
 def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report:
-    """Make the report on a calibration of the camera alone. views: those that `fit.views` names, in this order,
+    """Make the report on a calibration of the camera alone. views: the views that `fit.views` names, in this order,
     outliers included."""
     rows = [
         (

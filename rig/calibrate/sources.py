@@ -45,8 +45,9 @@ class ViewSources:
 def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
     """Find out what each source is. Without any, the bundled simulated rig is used.
 
-    pictures: whether picture files are allowed. scene: for a simulated rig; None means its own scene or, if that has no
-    board, the bundled scene 'board'. Raises UsageError with a line per problem, DeviceError for an unreadable scene.
+    pictures: whether picture files are allowed. scene: scene for a simulated rig; None means its own scene or, if that
+    has no board, the bundled scene 'board'. Raises UsageError with a line per problem, DeviceError for an unreadable
+    scene.
     """
     live, problems, notes = list[RigConfig](), list[str](), list[str]()
     sessions, recorded, found = list[Path](), list[Path](), list[Path]()

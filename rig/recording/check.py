@@ -54,10 +54,10 @@ _NOT_ITS_OWN: Final = "bring its own segments back, or let 'rig repair' take it 
 class SoundBlock:
     """A block with correct checksums. Only the checksum of the pixels may be missing (see `objection`).
 
-    entry: its index record. first_tick, last_tick: clock ticks of its first and last frame; 0 if it has no frame.
-    last_sweep: number of scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose
-    ticks do not rise; they count as missing. payload_crc: as its trailer states it; 0 if it has none. objection: why
-    the block cannot be what was recorded; None if it can.
+    entry: index record of the block. first_tick, last_tick: clock ticks of its first and last frame; 0 if it has no
+    frame. last_sweep: number of scan markers up to its last frame. repeated: (first, last) of each stretch of frames
+    whose ticks do not rise; they count as missing. payload_crc: as its trailer states it; 0 if it has none. objection:
+    why the block cannot be what was recorded; None if it can.
     """
 
     entry: bytes
@@ -135,7 +135,8 @@ class Continuity:
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
         """Note the gaps before and between the blocks of a start, and what is wrong with their numbers and ticks.
 
-        number: of the start. is_part: whether the recording was cut from another one, so that it may begin anywhere.
+        number: number of the start. is_part: whether the recording was cut from another one, so that it may begin
+        anywhere.
         """
         first = run[0]
         self.gaps += [

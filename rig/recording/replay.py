@@ -60,7 +60,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
     """Make the config of the rig that plays a recording. Raises UsageError if there is no recording that can be played,
     or for a wrong request; DamagedRecordingError if the recording's manifest or other files are damaged.
 
-    request: its settings of the estimate, where given, replace those of the recording.
+    request: options of the replay. Settings of the estimate that it gives replace those of the recording.
     others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
     """
     try:
@@ -225,9 +225,9 @@ class ReplayFacts:
 class RecordedStart:
     """One start of the SPAD in a recording.
 
-    number: of the start. begin: the sweep with which its whole maps begin. first_map: number of the first of these maps
-    in the recording. sweeps: how many whole maps. gone: frames at the start's ends that the manifest mentions but no
-    block contains.
+    number: number of the start. begin: the sweep with which its whole maps begin. first_map: number of the first of
+    these maps in the recording. sweeps: how many whole maps. gone: frames at the start's ends that the manifest
+    mentions but no block contains.
     """
 
     number: int

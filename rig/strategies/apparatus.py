@@ -21,7 +21,7 @@ from drivers.interfaces import World
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limit of a measurement. time_s: from the beginning of the first exposure to the end of the last one."""
+    """Limit of a measurement. time_s: time from the beginning of the first exposure to the end of the last one."""
 
     time_s: float
 
@@ -107,10 +107,10 @@ class MakesApparatus(World, Protocol):
         """Make an apparatus at time 0. Light transport is kept, so another apparatus for the same rows and columns is
         made quickly.
 
-        rows: image rows to measure, ascending. columns: their number. command_range: first and last command of the
+        rows: image rows to measure, ascending. columns: number of columns. command_range: first and last command of the
         mirror; as in a scan, column c is the line at the command first + (c + 0.5) (last - first) / columns. power_w:
-        mean power of the source. rule: how the columns that are lit share it. seed: of all random draws. depth_range_m:
-        range for which the gate of pulses is open. spad_frame_s: see `Apparatus`. Raises ValueError for impossible
-        values, and DeviceError for a scene that moves.
+        mean power of the source. rule: how the columns that are lit share it. seed: decides all random draws.
+        depth_range_m: range for which the gate of pulses is open. spad_frame_s: see `Apparatus`. Raises ValueError for
+        impossible values, and DeviceError for a scene that moves.
         """
         ...

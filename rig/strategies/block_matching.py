@@ -54,8 +54,8 @@ class Matches(NamedTuple):
 
 
 def bands(rows: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Parts of `rows` to match one after the other. For each part two slices: of `rows`, the rows to match together; of
-    these rows, those whose result is to be kept.
+    """Parts of `rows` to match one after the other. Each part is two slices. The first selects, from `rows`, the rows
+    to match together. The second selects, from these, the rows whose result is to be kept.
 
     Rows that are matched together are neighbours in the picture. Half a block of rows on either side is added to those
     whose result is kept, where there are such rows.

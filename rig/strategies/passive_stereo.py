@@ -50,8 +50,8 @@ class Rectified(NamedTuple):
     """Rectification of the pictures of two cameras.
 
     focal_baseline: b f in pixels times metres, positive if the second camera stands on the right of the first, else
-    negative. maps: of both cameras, for `cv2.remap`; None if the pictures need no change. matrix: (3, 3), camera matrix
-    of the rectified first camera. It looks in the same direction as before.
+    negative. maps: arguments of `cv2.remap` for each camera; None if the pictures need no change. matrix: (3, 3),
+    camera matrix of the rectified first camera. It looks in the same direction as before.
     """
 
     focal_baseline: float

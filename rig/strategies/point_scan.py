@@ -51,7 +51,8 @@ frames."""
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Spots of a scan. rows: indices of measured rows. columns: of the projector. frames: number for each spot."""
+    """Spots of a scan. rows: indices of measured rows. columns: numbers of the projector's columns. frames: number of
+    frames for each spot."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]

@@ -99,8 +99,8 @@ class ColumnGeometry:
     ) -> None:
         """Make the geometry of a calibrated rig.
 
-        commands: of the mirror at the centres of columns, (columns,). depth_range_m: near and far end. rows: image rows
-        that are measured, ascending.
+        commands: mirror commands at the centres of columns, (columns,). depth_range_m: near and far end. rows: image
+        rows that are measured, ascending.
 
         Raises UsageError for light that is bent (it bows, or rows are exposed one after the other), for fewer than two
         columns, for rows that the camera does not have, and as `sweep_geometry` does.

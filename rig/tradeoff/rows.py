@@ -59,10 +59,11 @@ class TradeoffRow:
     """A setting in one scene and fog, over all repeats: errors relative to the world's truth, and times.
 
     fog: a visibility or 'clear'; None for the scene's own fog.
-    sensor_ms: of one map, with dark frames and fly-back.
-    compute_ms: of a map after the first, with counting and everything else.
-    mean_abs_px: over every (row, column) with a true stripe; a missing answer counts as `MISSING_PX`.
-    within_1px, missing: shares of the true stripes.
+    sensor_ms: time of the sensor for a map, with dark frames and fly-back.
+    compute_ms: computing time of a map after the first, with counting and everything else.
+    mean_abs_px: mean |error| of stripes over every (row, column) with a true stripe; a missing answer counts as
+    `MISSING_PX`.
+    within_1px, missing: shares of the true stripes with an answer within 1 px, and without an answer.
     depth_mm: mean depth error; None if no pixel has a depth.
     ci95: confidence interval of mean_abs_px, over repeats or else over blocks of the map.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from the median |error|; None without any.

@@ -75,8 +75,8 @@ class StrategyRow:
     then says how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median
     depth error. range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is
     none. spent_ms: sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included.
-    laser_class, laser_class_still: of the source while it works, and if it stood still; None without a source, or if
-    its light is not visible.
+    laser_class: class of the source while it works; laser_class_still: its class if it stood still. Both are None
+    without a source, or if its light is not visible.
     """
 
     strategy: str
@@ -106,8 +106,8 @@ class StrategyRow:
 class Comparison:
     """Result of a comparison.
 
-    rows: those that are complete. verdict: 'aborted' if an interrupt ended it. sentences: what each strategy does, by
-    its name. notes: lines that must be shown with the result. folder: where it was written.
+    rows: the complete rows. verdict: 'aborted' if an interrupt ended it. sentences: what each strategy does, by its
+    name. notes: lines that must be shown with the result. folder: where it was written.
     """
 
     rows: tuple[StrategyRow, ...]

@@ -144,12 +144,12 @@ class Field:
         return Beam(power_w, map_s * self.across, 1 / map_s), Beam(power_w)
 
     def pattern(self) -> tuple[Beam, Beam]:
-        """The same beam twice, as it never moves: that of a projector's picture with half of its columns lit, for a
-        pupil that lies in lit columns only."""
+        """Beam of a projector's picture with half of its columns lit, for a pupil that lies in lit columns only. It is
+        returned twice, since it does not scan."""
         beam = Beam(min(2 * self.of_picture, 1.0) * self.power_w)
         return beam, beam
 
     def flash(self, pulse_s: float, rate_hz: float) -> tuple[Beam, Beam]:
-        """The same beam twice, as it never moves: that of short pulses that light the whole field."""
+        """Beam of short pulses that light the whole field. It is returned twice, since it does not scan."""
         beam = Beam(self.of_picture * self.power_w / (pulse_s * rate_hz), pulse_s, rate_hz)
         return beam, beam

@@ -67,7 +67,8 @@ def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, 
     """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if the scene cannot be read
     or names surfaces that are not there.
 
-    air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: of the camera, for `ramp`.
+    air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: the rig whose camera
+    `ramp` is made for.
     """
     content = _content(scene, model, folder)
     if air is not None:

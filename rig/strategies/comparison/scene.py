@@ -32,8 +32,8 @@ LINES: Final = 8
 class Place:
     """A scene in an air, and what is seen of it.
 
-    name: of the scene in the table. scene: a bundled name, `ramp`, a file or a folder. air: None for the scene's own.
-    rows: number of image rows, from the middle of the picture. lux: ambient light; None for the scene's own.
+    name: name of the scene in the table. scene: a bundled name, `ramp`, a file or a folder. air: None for the scene's
+    own. rows: number of image rows, from the middle of the picture. lux: ambient light; None for the scene's own.
     """
 
     name: str

@@ -156,8 +156,8 @@ class CodeBook:
 def code_book(kind: Words, numbers: int, frames: int) -> CodeBook:
     """Code book with at least `numbers` words and at most `frames` patterns.
 
-    All patterns of a code get the same number of frames. Of the codes that fit, the one is taken whose words differ in
-    the largest number of frames. Raises `TooShort` if even the shortest has more patterns than there are frames.
+    All patterns of a code get the same number of frames. Of the codes that fit, the one is taken in which any two words
+    differ in the most frames. Raises `TooShort` if even the shortest has more patterns than there are frames.
     """
     if kind == "repetition":
         bits = bits_for(numbers)

@@ -82,8 +82,8 @@ def measured(
     """Show patterns (patterns, columns) and return what pixels saw. weights: shares of the SPAD's time, by pattern.
 
     A conventional camera exposes all patterns equally. If an exposure would saturate, it takes several shorter ones of
-    each pattern, whose levels are averaged. Raises `TooShort` if the budget is too short for all patterns. A camera's
-    variance is only that of rounding until `with_noise` has fitted it.
+    each pattern, and their levels are averaged. Raises `TooShort` if the budget is too short for all patterns. A
+    camera's variance is only that of rounding until `with_noise` has fitted it.
     """
     if camera == "spad":
         frames = spad_frames(apparatus, budget, weights)
