@@ -154,7 +154,8 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 
 
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Whole frames of the sensor. The window lies where the geometry puts it; the other pixels are copies of it."""
+    """Whole frames of the sensor. The window lies where the geometry puts it; the other pixels are copies of the
+    window."""
     copies = WIDTH // narrow.window
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))

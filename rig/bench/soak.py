@@ -308,9 +308,11 @@ def quiet_sweeps() -> Iterator[None]:
 def looped_rig(
     policy: Overload, request: SoakRequest, changes: Mapping[str, object] | None = None
 ) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD.
+    """Context with the simulated rig, in which a looped SPAD takes the place of the rig's own SPAD, and with the looped SPAD.
+    The looped SPAD plays what the rig's own SPAD recorded.
 
-    changes: further settings of the config, by their keys."""
+    changes: further settings of the config, by their keys.
+    """
     # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {
         "scanner.clock_error": "0 ppm",

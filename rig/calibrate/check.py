@@ -51,7 +51,8 @@ def calibrate_check(
     request, changes: options, as a `CheckRequest` or by the names of its fields.
     ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
 
-    If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
+    If the calibration states its rig, the result is noted beside its file. Scans refuse a calibration with a note of a
+    failed check.
 
     Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, UsageError for a wrong
     request and for views that the calibration was made from.

@@ -90,7 +90,7 @@ CLEAR_SIGMAS = 4.0
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
-    """Light of up to `rows` rows of a config's scene, drawn at random over columns; the same for the same seed.
+    """Light of up to `rows` rows of a config's scene, at random columns. The same seed gives the same rows.
 
     Halo, drops and ambient light are those at the true position. Rows whose stripe is split, hidden or outside the
     depth range are left out. Raises UsageError without a world, a calibration or any stripe, and for a rig of several

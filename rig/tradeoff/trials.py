@@ -62,7 +62,7 @@ class Tradeoff:
     answer: the setting to use; None without a wish, or if each setting has too many missing answers.
     verdict: 'aborted' if an interrupt ended it; the rows are then those that were complete.
     folder: where everything was written; None if nothing was.
-    accepted_calibration: reasons to refuse the calibration, which was used all the same.
+    accepted_calibration: reasons against the calibration that was used in spite of them.
     """
 
     rows: tuple[TradeoffRow, ...]

@@ -15,8 +15,8 @@ then P / (2 pi) sqrt(2 / N) for a period of P columns. There are three ways to k
   one with three shifts and the others once. Haze is wide, so it has no contrast at short periods, and is the same for
   all of them.
 
-OpenCV's `SinusoidalPattern` has only three shifts of 8-bit images, and counts periods along paths over the picture,
-which end at depth edges. Tests compare with it for three shifts.
+OpenCV's `SinusoidalPattern` has only three shifts of 8-bit images, and counts periods along paths over the picture.
+Such a path ends at a depth edge. Tests compare with it for three shifts.
 """
 
 from dataclasses import dataclass
