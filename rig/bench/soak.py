@@ -308,7 +308,8 @@ def quiet_sweeps() -> Iterator[None]:
 def looped_rig(
     policy: Overload, request: SoakRequest, changes: Mapping[str, object] | None = None
 ) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """Context with the simulated rig, in which a looped SPAD takes the place of the rig's own SPAD, and with the looped SPAD.
+    """A context that gives the simulated rig with a looped SPAD in place of its own, and this SPAD by itself.
+
     The looped SPAD plays what the rig's own SPAD recorded.
 
     changes: further settings of the config, by their keys.
