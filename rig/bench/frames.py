@@ -154,7 +154,8 @@ def window_frames(window: int, workers: RowWorkers, n_bytes: int = FRAMES_BYTES)
 
 
 def full_frames(narrow: BenchFrames, n_bytes: int = FRAMES_BYTES) -> BenchFrames:
-    """Whole frames of the sensor. The window lies where the geometry puts it; the other pixels are copies of it."""
+    """Whole frames of the sensor. The window lies where the geometry puts it; the other pixels are copies of the
+    window."""
     copies = WIDTH // narrow.window
     places = BLOCK_PLACES * max(1, n_bytes // (BLOCK_FRAMES * narrow.frame_bytes * copies))
     bits = np.tile(narrow.bits[: places * PLACE_FRAMES], (1, 1, copies))
@@ -200,7 +201,8 @@ PATCH = 16
 class BenchSurface:
     """A surface that a whole sweep sees.
 
-    place_px: float32 (columns, rows), the stripe's place in its window; photons: of the stripe, of the same shape.
+    place_px: float32 (columns, rows), the stripe's place in its window; photons: photons of the stripe per exposure, of
+    the same shape.
     """
 
     place_px: NDArray[np.float32]

@@ -51,7 +51,8 @@ LEAD_FRAMES = 200
 class Loop:
     """Frames of whole sweeps, from the frame with one scan marker to just before the frame with another.
 
-    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: their number; width: px of a frame.
+    records: (n,) of `FRAME_RECORD`; bits: uint8 (n, rows, row bytes); sweeps: number of sweeps; width: width of a frame
+    in px.
     """
 
     records: NDArray[np.void]
@@ -71,7 +72,7 @@ class Loop:
 
 
 class LoopedSpad(SpadArray):
-    """A SPAD that plays a loop. timing: of the SPAD that took the loop's frames. info: of the SPAD to be played."""
+    """A SPAD that plays a loop. timing: timing of the SPAD that took the frames. info: info of the SPAD to imitate."""
 
     def __init__(self, loop: Loop, info: SpadInfo, timing: SpadTiming) -> None:
         super().__init__("looped SPAD")
@@ -221,10 +222,10 @@ class SoakFrames:
 class SoakReport:
     """Findings of a soak.
 
-    seconds: of stream played. maps: number made, of maps_planned. times_real_time: time span of the received frames,
-    divided by the time spent on binding, counting and making maps of them; the first map is left out. resident_*:
-    memory of the process after a tenth of the maps and at the end, and its growth as a share; None if the system does
-    not report it.
+    seconds: length of the stream that was played. maps: number of maps made, of maps_planned. times_real_time: time
+    span of the received frames, divided by the time spent on binding, counting and making maps of them; the first map
+    is left out. resident_*: memory of the process after a tenth of the maps and at the end, and its growth as a share;
+    None if the system does not report it.
     source_late_max_s: largest lateness of a block. ended_by: the error that ended the run early; None if none did.
     """
 
@@ -253,10 +254,10 @@ class SoakReport:
 
 
 def soak(request: SoakRequest | None = None, *, progress: Progress | None = None, **changes: Any) -> SoakReport:
-    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`).
+    """Play a stream of 100 kHz in real time through the acquisition (`rig bench --soak`). A stream that the
+    overload policy ends gives a report too.
 
-    request, changes: options, as a `SoakRequest` or by the names of its fields: `soak(seconds=10, window=True)`. A
-      stream that the overload policy ends gives a report too.
+    request, changes: options, as a `SoakRequest` or by the names of its fields: `soak(seconds=10, window=True)`.
     progress: called with frames done and frames planned.
 
     Raises UsageError for a request that cannot be met.
@@ -307,9 +308,12 @@ def quiet_sweeps() -> Iterator[None]:
 def looped_rig(
     policy: Overload, request: SoakRequest, changes: Mapping[str, object] | None = None
 ) -> Iterator[tuple[OpenRig, LoopedSpad]]:
-    """The simulated rig with a looped SPAD, which plays what the rig's own SPAD recorded; and the looped SPAD.
+    """A context that gives the simulated rig with a looped SPAD in place of its own, and this SPAD by itself.
 
-    changes: further settings of the config, by their keys."""
+    The looped SPAD plays what the rig's own SPAD recorded.
+
+    changes: further settings of the config, by their keys.
+    """
     # With clocks that agree exactly, the loop closes without a jump.
     settings: dict[str, object] = {
         "scanner.clock_error": "0 ppm",

@@ -68,9 +68,10 @@ Workers = Mapping[int, RowWorkers]
 class Extent:
     """Amount of work that is measured.
 
-    moment_s: time of each row in each of the `rounds`; count_moment_s: of the rows `count`, which are fast.
-    latency_s: length of the stream for the latency. frames_bytes, read_bytes: memory of the frames of each window, and
-    for the plain read. map_rows, map_columns: size of the complete maps.
+    windows: widths in px. exposures: numbers per column. moment_s: time of each row in each of the `rounds`;
+    count_moment_s: the same for the rows `count`, which are fast. latency_s: length of the stream for the latency.
+    frames_bytes, read_bytes: memory of the frames of each window, and for the plain read. map_rows, map_columns: size
+    of the complete maps.
     """
 
     windows: tuple[int, ...] = WINDOWS
@@ -107,9 +108,9 @@ class SpeedRow:
     """A row of the table. exposures: None for stages without columns. Numbers without a meaning for a stage are None.
 
     of_memory_bandwidth: bytes of frames read a second, divided by the memory's bandwidth. times_numpy: speed divided by
-    that of the row `numpy`. ms_per_map: of stages that make complete maps. times_sgbm: for `joint`, the time of a map
-    divided by that of a StereoSGBM map on as many threads, measured alternately. The error fields are those of
-    `StripeError`.
+    that of the row `numpy`. ms_per_map: time of a map, of stages that make complete ones. times_sgbm: for `joint`, the
+    time of a map divided by that of a StereoSGBM map on as many threads, measured alternately. The error fields are
+    those of `StripeError`.
     """
 
     stage: str
@@ -129,9 +130,9 @@ class SpeedRow:
 
 @dataclass(frozen=True, slots=True)
 class WorkingPoint:
-    """Whether an estimator keeps up with the sensor, including counting.
+    """Whether an estimator, with counting, keeps up with the sensor.
 
-    maps_per_s: of COLUMNS columns; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
+    maps_per_s: possible maps of COLUMNS columns a second; needed_per_s: maps a second of a sensor at REAL_TIME_HZ.
     """
 
     estimator: str
@@ -146,7 +147,7 @@ class WorkingPoint:
         return self.maps_per_s >= self.needed_per_s
 
     def __str__(self) -> str:
-        """In words."""
+        """Say in words whether it keeps up."""
         at = f"at K = {self.exposures} with {self.estimator} on {self.threads} thread{'s' * (self.threads > 1)}"
         needed, possible = digits(self.needed_per_s), digits(self.maps_per_s)
         if self.keeps_up:
@@ -156,7 +157,7 @@ class WorkingPoint:
 
 @dataclass(frozen=True, slots=True)
 class SpeedReport:
-    """Findings of `rig bench`."""
+    """Findings of `rig bench`. seconds: time that it took."""
 
     machine: dict[str, Any]
     memory_read_gb_per_s: float

@@ -49,7 +49,8 @@ NUMPY_PIECE = 20
 
 @dataclass(frozen=True, slots=True)
 class StripeError:
-    """Mean and median |estimate - truth| of the rows and columns with an estimate; missing: share of those without."""
+    """Mean and median |estimate - truth| of the rows and columns with an estimate; missing: share of those without. The
+    first two are NaN without any estimate."""
 
     mean_abs_px: float
     median_abs_px: float
@@ -309,7 +310,8 @@ def sgbm_stage(surface: BenchSurface, threads: int) -> Stage:
 
 @contextmanager
 def matching(pictures: tuple[Bits, Bits], threads: int) -> Iterator[Callable[[], NDArray[np.int16]]]:
-    """Give a function that makes a map of both pictures with StereoSGBM: disparities in 1 / SGBM_STEPS px."""
+    """Give a function that makes a map of both pictures with StereoSGBM: disparities in 1 / SGBM_STEPS px. Meanwhile
+    OpenCV uses `threads` threads."""
     import cv2
 
     area = SGBM_BLOCK_PX**2

@@ -24,7 +24,8 @@ ENOUGH_FRAMES = 1000
 
 
 def warm_rig(config: RigConfig) -> float:
-    """Compile everything that the rig needs, and return the seconds it took. Real devices are not opened."""
+    """Compile everything that the rig needs, and return the seconds it took. Devices are opened only if the rig has a
+    simulated world."""
     begun = time.perf_counter()
     for done, estimator in enumerate(ESTIMATORS):
         tell_stage("warming up", done, len(ESTIMATORS), "estimators")

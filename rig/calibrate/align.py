@@ -6,8 +6,8 @@ over. It publishes what a scan publishes, so that the page of `rig view --live` 
 The width of the line (focus) is its full width at half maximum in pixels of the sensor. It comes from the
 autocorrelation of the counts along a row, averaged over many rows and columns. No line has to be found for that, so it
 works far out of focus and in little light: the noise of two pixels is independent, so it cancels at every lag but 0,
-which is not used, as do hot pixels. A line of Gaussian shape has an autocorrelation wider by the square root of 2. The
-pixel's own width is in it. Haze and saturation make the line seem wider.
+and lag 0 is not used. Hot pixels cancel too. A line of Gaussian shape has an autocorrelation wider by the square root
+of 2. The width includes the pixel's own. Haze and saturation make the line seem wider.
 """
 
 import math
@@ -62,12 +62,12 @@ SURELY_SD: Final = 8.0
 class AlignFigures:
     """The figures of a sweep. Rates are detections per exposure of a pixel.
 
-    sweeps: number of the sweep, from 1. power_w: of the laser; limit_w: the most that it may be given.
-    focus_px: width of the line, None if none stands out; left_px, middle_px, right_px: in the thirds of the image.
-    line_seen: share of rows and columns with a sure stripe. peak_rate: median rate at the brightest pixel of these
-    stripes; scan_peak_rate: the same, foreseen for the power of a scan; saturated_fraction: share of these stripes
-    whose brightest pixel is SATURATED or above. All three are None without a sure stripe.
-    mean_rate: of all pixels. lost: frames lost so far.
+    sweeps: number of the sweep, from 1. power_w: power of the laser; limit_w: its largest allowed power.
+    focus_px: width of the line, None if none stands out; left_px, middle_px, right_px: its width in each third of the
+    image. line_seen: share of rows and columns with a sure stripe. peak_rate: median rate at the brightest pixel of
+    these stripes; scan_peak_rate: the rate expected there with the power of a scan; saturated_fraction: share of these
+    stripes whose brightest pixel has a rate of SATURATED or more. All three are None without a sure stripe.
+    mean_rate: mean over all pixels. lost: number of frames lost so far.
     """
 
     sweeps: int
@@ -104,7 +104,8 @@ class AlignFigures:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The end of an alignment. last: the figures of its last sweep; None if there was no whole one."""
+    """Result of an alignment. name: name of the config. last: figures of the last sweep; None if there was no whole
+    one."""
 
     name: str
     last: AlignFigures | None
@@ -156,9 +157,10 @@ def align(
 
 
 def low_power_w(rig: OpenRig, asked: str | None) -> float:
-    """The laser's power for an alignment. asked: as text; None for LOW_POWER of its limit, or the least that it takes.
+    """The laser's power for an alignment. asked: text such as '2 mW'; None: LOW_POWER times its limit, or its least
+    power if that is more.
 
-    Raises UsageError for a power outside the laser's limits.
+    Raises UsageError for a text that is no power, and for a power outside the laser's limits.
     """
     limits = rig.laser.limits
     if asked is None:
@@ -226,9 +228,10 @@ def _aligned(
 class LineLook:
     """The line in the counts of one sweep.
 
-    sweep: its number, from 1. widths_px: of the line in the whole image and in its thirds, None where none stands out.
-    line_seen, mean_rate: as in `AlignFigures`. peak_rates: float64 (n,), of the sure stripes' brightest pixels.
-    profile: float64 (width,), detections per exposure and pixel at each x, mean over the sweep and the rows.
+    sweep: its number, from 1. widths_px: widths of the line in the whole image and in its thirds, None where none
+    stands out. line_seen, mean_rate: as in `AlignFigures`. peak_rates: float64 (n,), rates of the sure stripes'
+    brightest pixels. profile: float64 (width,), detections per exposure and pixel at each x, mean over the sweep and
+    the rows.
     """
 
     sweep: int
@@ -282,7 +285,7 @@ class LineLook:
 
 
 def row_rates(volume: CountVolume) -> Float64:
-    """Rates of detection along rows, float64 (n, width): MOST_PLACES columns and rows, spread evenly over the sweep."""
+    """Rates of detection along rows, float64 (n, width): up to MOST_PLACES columns and rows each, spread evenly."""
     columns, rows, window = volume.counts.shape
     some = np.linspace(0, columns - 1, min(columns, MOST_PLACES)).astype(int)
     at = np.linspace(0, rows - 1, min(rows, MOST_PLACES)).astype(int)

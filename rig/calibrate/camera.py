@@ -38,6 +38,7 @@ def calibrate_camera(
 
     sources: rigs or folders of views, as for the other calibrations, or pictures, or folders of pictures.
     request, changes: options, as a `CameraRequest` or by the names of its fields.
+    ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
 
     Raises UsageError for a wrong request, and Degenerate if the views give no calibration: its message is the likeliest
     cause, its notes are other possible ones.

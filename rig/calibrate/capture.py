@@ -1,10 +1,10 @@
 """Takes one view of the board from a scan of it: the board's picture, its corners, and the passages of every sweep.
 
 `capture_view` scans a live rig, `capture_recorded` reads a recorded run. An existing calibration is not used in the
-scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command at the instant
-when the line's centre crosses a pixel: as sent, not corrected for lag. If a SPAD cannot send or keep whole frames fast
-enough, it sends the windows of the existing calibration instead, and the plan then allows for the known lag. Windows
-and lag do not change the passages, except that a line outside the windows is not seen.
+scan, so that nothing of it enters the new one: whole rows are counted. A passage is the mirror command, as sent and not
+corrected for lag, at the instant when the line's centre crosses a pixel. If a SPAD cannot send or keep whole frames
+fast enough, the windows of the existing calibration are used instead, and the plan then allows for its known lag.
+Neither changes the passages, except that a line outside the windows is not seen.
 
 Passages are kept for pixels spread evenly over the board, away from printed edges, or over the whole picture if no
 board was found. The first half millisecond of a sweep is left out, because the mirror lags and is still accelerating
@@ -82,8 +82,8 @@ def capture_view(
     """Scan once, in both directions, and take the view.
 
     board: None if there is none; passages are then kept over the whole picture.
-    seed: of everything simulated.
-    exposures: per column; None: the config's.
+    seed: decides all random draws of a simulation.
+    exposures: number of exposures per column; None: the config's.
     arm: must be True if laser or gate are real.
     defects: (rows, width), pixels that are not used.
     out: folder to record the scan into; None writes nothing.
@@ -174,7 +174,8 @@ def scan_sweeps(
     out: OutFolder = None,
     prepared: tuple[ScanPlan, SpadTiming] | None = None,
 ) -> None:
-    """Scan only for the listeners and, with `out`, a recording. An interrupt is raised again once the rig is safe."""
+    """Scan only for the listeners and, with `out`, a recording. prepared: what `prepare` has returned, if it was called
+    before. An interrupt is raised again once the rig is safe."""
     scan, estimate = rig.config.scan, rig.config.estimate
     tally = MapTally(scan.columns, scan.exposures, estimate.estimator, estimate.filter)
     request = RunRequest(maps=maps, record=out is not None, accept_calibration=True)
@@ -272,8 +273,8 @@ class SpeedRotation:
     """Takes successive views at different speeds in turn (see the module)."""
 
     def __init__(self, exposures: Sequence[int], sees: Callable[[Capture], bool], tell: TellLine | None = None) -> None:
-        """exposures: numbers per column that take turns; empty: the config's. sees: whether a capture shows enough of
-        the line."""
+        """Begin the rotation. exposures: numbers per column that take turns; empty: the config's. sees: whether a
+        capture shows enough of the line."""
         self.turns = list(exposures)
         self._sees = sees
         self._tell = tell or (lambda line: None)

@@ -1,4 +1,4 @@
-"""`rig calibrate check`: judges a calibration by views of a flat board from which it was not made."""
+"""`rig calibrate check`: judges a calibration by views of a flat board that it was not made from."""
 
 import math
 from collections.abc import Sequence
@@ -45,9 +45,14 @@ def calibrate_check(
     tell: TellLine | None = None,
     **changes: Any,
 ) -> CalibrationResult:
-    """Judge a calibration by views of a flat board from which it was not made (`rig calibrate check`).
+    """Judge a calibration by views of a flat board that it was not made from (`rig calibrate check`).
 
-    If the calibration states its rig, the result is noted beside its file. Scans refuse it if a failed check is noted.
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `CheckRequest` or by the names of its fields.
+    ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
+
+    If the calibration states its rig, the result is noted beside its file. Scans refuse a calibration with a note of a
+    failed check.
 
     Raises Degenerate if the board cannot be used, CalibrationError if the calibration cannot, UsageError for a wrong
     request and for views that the calibration was made from.

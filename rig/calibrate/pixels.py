@@ -192,7 +192,7 @@ WORST_PRECISION: Final = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelResult:
-    """A map of the pixels and its verdict.
+    """A map of the pixels (`found`) and its verdict.
 
     drift: change since the older map `against`; None without one.
     leak: correlation of neighbouring pixels' rates, a sign of light in the dark frames; 0 for a recorded run.
@@ -258,7 +258,8 @@ class PixelResult:
 
 
 def pixel_verdict(pixels: pixel_map.PixelMap, drift: pixel_map.PixelDrift | None, leak: float) -> Verdict:
-    """Judge whether the map may be believed and, if there is a drift, the older one still holds. Root cause first."""
+    """Judge whether the map may be believed and, if a `drift` is given, whether the older one still holds. Reasons
+    begin with the root cause."""
     reasons = []
     if leak > MOST_LEAK:
         said = f"the rates of neighbouring pixels correlate by {leak:.2f}, in the dark by {MOST_LEAK:g} at most"
@@ -314,7 +315,10 @@ def calibrate_pixels(
 
     source: a rig, or the folder of a recorded run.
     covered: called when a person has to cover the lens; it must return once that is done.
-    Raises UsageError for a wrong request or file, DeviceError or DevicesError if devices fail.
+
+    The older map is the request's `against` or, without that, the one beside a rig's calibration; a note beside that
+    calibration then says whether the older map still holds. Raises UsageError for a wrong request or file, DeviceError
+    or DevicesError if devices fail.
     """
     request = replace(request or PixelsRequest(), **changes)
     path, frames = None if isinstance(source, RigConfig) else Path(source), request.frames

@@ -50,9 +50,13 @@ def calibrate_planes(
 ) -> CalibrationResult:
     """Calibrate camera, light planes and lag together from views of a board (`rig calibrate planes`).
 
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `PlanesRequest` or by the names of its fields.
+    ask: asks a person to move the board; needed for a real rig. tell: gets a line on each view.
+
     The fit starts from the request's `calibration`, if there is one, and keeps its defects. Raises Degenerate, with
-    notes why, if the views give no model, CalibrationError if a file cannot be used or the line does not reach the
-    distance `at`, UsageError for a wrong request.
+    notes on the causes, if the views give no model, CalibrationError if a file cannot be used or the line does not
+    reach the distance `at`, UsageError for a wrong request.
     """
     request = replace(request or PlanesRequest(), **changes)
     values = si_values(request)
@@ -217,7 +221,8 @@ def guided(
     """Return a function that chooses the pose which lowers the expected error most, until the verdict passes or no
     pose is left.
 
-    start: chooses the poses until a fit of the session's views can be judged. fit, judge: as for the final result.
+    start: chooses the poses until a fit of the session's views can be judged. fit: makes such a fit; judge: judges it.
+    Before each pose, `session` tells the expected error.
     """
     asked: set[tuple[float, tuple[int, int], tuple[int, int]]] = set()
 

@@ -1,8 +1,8 @@
 """Makes the reports of `rig calibrate`, one HTML file each: verdict and reasons first, then the pictures.
 
 `planes_report`, `camera_report`, `check_report` and `sync_report` make the parts of a report: tables, pictures and
-charts. `report_page` makes the file from these, `pixel_page` that on a pixel map; the look is that of all reports
-(`rig.report.page`). `subject` says what a report is about, so that prints are not confused.
+charts. `report_page` makes the text of the file from these, `pixel_page` that of a report on a pixel map. All reports
+look alike (`rig.report.page`). `subject` says what a report is about, so that printed ones are not confused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,8 @@ Report = tuple[str, Sequence[Section]]
 
 
 def report_page(report: Report, verdict: Verdict, line: str, rows: Rows) -> str:
-    """The text of the HTML file: verdict with the summary line and its reasons, a table of `rows`, the sections."""
+    """The text of the HTML file: verdict with the summary line and its reasons, a table of `rows`, the sections of the
+    report."""
     word, reasons = "passed" if verdict.passed else "failed", [str(reason) for reason in verdict.reasons]
     box = verdict_box(word, line, reasons, good=verdict.passed)
     return page(report[0], [box, table(("", ""), rows) if rows else ""], report[1])
@@ -100,7 +101,8 @@ def view_colour(view: int) -> tuple[int, int, int]:
 
 
 def cells_picture(cells_m: Array) -> Picture:
-    """Draw deviations of a board's squares from their plane, (squares down, across): bright in front, black if NaN."""
+    """Draw deviations in m of a board's squares from their plane, (squares down, across): bright in front, NaN
+    black."""
     large = enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
@@ -180,7 +182,7 @@ def camera_sections(camera: Camera, views: Sequence[View], residuals_px: Sequenc
 
 
 def camera_report(fit: CameraFit, views: Sequence[View], board: Board) -> Report:
-    """Make the report on a calibration of the camera alone. views: those that `fit.views` names, in this order,
+    """Make the report on a calibration of the camera alone. views: the views that `fit.views` names, in this order,
     outliers included."""
     rows = [
         (
@@ -232,7 +234,7 @@ def sync_report(fit: SyncFit) -> Report:
 
 
 def corners_px(view: View) -> Array:
-    """Corners of a view in pixels, float64 (n, 2), without those that are not finite."""
+    """Corners of a view in pixels, float64 (n, 2), without those that are not finite; empty if no board was found."""
     if view.corners is None:
         return np.zeros((0, 2))
     px = np.asarray(view.corners.px, np.float64)

@@ -3,8 +3,8 @@
     views/000.npz ...  rig.json (the rig of the views)  board.yaml (their board)  calibration.yaml (+ .npy)  camera.yaml
     report.html  summary.json
 
-`Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. A session that was
-interrupted, or whose views gave no calibration, leaves its views, which can be a source for the next. A view's file,
+`Session` holds the views and writes all files; `CalibrationResult` is what a calibration returns. If a session was
+interrupted, or if its views gave no calibration, they are kept and can be a source for the next one. A view's file,
 `views/000.npz`, has all that a fit needs. It is written completely or not at all:
 
     format_version () int   name () str   picture (height, width) float32, if there is one
@@ -279,7 +279,8 @@ def told(view: View, refused: Degenerate | None) -> str:
 
 
 def true_model(live: RigConfig | None) -> RigModel | None:
-    """The true rig model, from a world that knows it; None for a real rig. Call it only after all estimates."""
+    """The true rig model, from a world that knows it; None for a real rig, or if its world does not know. Call it only
+    after all estimates."""
     if live is None or live.world is None:
         return None
     with open_rig(live.model_copy(update={"calibration": None})) as rig:

@@ -45,8 +45,9 @@ class ViewSources:
 def sort_sources(sources: SourcesLike, *, pictures: bool = False, scene: str | None = None) -> ViewSources:
     """Find out what each source is. Without any, the bundled simulated rig is used.
 
-    pictures: whether picture files are allowed. scene: for a simulated rig; None means its own scene or, if that has no
-    board, the bundled scene 'board'. Raises UsageError with a line per problem, DeviceError for an unreadable scene.
+    pictures: whether picture files are allowed. scene: scene for a simulated rig; None means its own scene or, if that
+    has no board, the bundled scene 'board'. Raises UsageError with a line per problem, DeviceError for an unreadable
+    scene.
     """
     live, problems, notes = list[RigConfig](), list[str](), list[str]()
     sessions, recorded, found = list[Path](), list[Path](), list[Path]()
@@ -117,8 +118,8 @@ _QUANTITIES = {
 
 
 def si_values(request: CalibrationRequest) -> dict[str, float]:
-    """The quantities that a request states, in SI units, by the names in `_QUANTITIES`. Raises UsageError with a line
-    for each that is wrong, and for wrong exposures, poses and seeds."""
+    """The quantities that a request states, in SI units, by names such as `accuracy_m`; without those that it does not
+    state. Raises UsageError with a line for each that is wrong, and for wrong exposures, poses and seeds."""
     exposures, poses = getattr(request, "exposures", ()), getattr(request, "poses", 1)
     problems = [f"exposures has {k}; it must be at least 1" for k in exposures if k < 1]
     if poses < 1:
@@ -142,7 +143,7 @@ def si_values(request: CalibrationRequest) -> dict[str, float]:
 
 
 def known_camera(file: Path, *, accept: bool = False) -> tuple[KnownCamera, list[Refusal]]:
-    """Read a camera file; return the camera and the accepted reasons against it; empty if it has not failed.
+    """Read a camera file; return the camera and the accepted reasons against it, none if it has not failed.
 
     accept: whether to use a camera whose verdict is 'failed'. Raises UsageError for one that is not accepted, and
     CalibrationError if the file is no camera file. A camera without a verdict is used.

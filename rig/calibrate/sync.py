@@ -6,8 +6,8 @@ the frames show when the light does. A pattern generator, a long cable and a las
 their sum is seen, on the SPAD's clock. The line must be in the picture when the gate opens or closes.
 
 If the line is so bright that pixels saturate, a frame lit for part of its exposure looks lit for longer, and tells
-little about the time within it. Saturation shows in the pixels that fire in two successive frames. The motion of the
-line from frame to frame reduces their number; the frame after the next one shows by how much.
+little about the time within it. Saturation shows in the number of pixels that fire in two successive frames. The motion
+of the line from frame to frame reduces this number; the frame after the next one shows by how much.
 """
 
 import math
@@ -95,6 +95,9 @@ def calibrate_sync(
     **changes: Any,
 ) -> CalibrationResult:
     """Measure the mirror's lag in each direction and the rows' delay from one unmoved scene (`rig calibrate sync`).
+
+    sources: a rig, recorded runs, or folders of earlier calibrations; empty: the bundled simulated rig.
+    request, changes: options, as a `SyncRequest` or by the names of its fields. tell: gets a line on each view.
 
     The lags are put into a copy of the request's calibration, or else of the rig's own, if there is one. Raises
     Degenerate if they cannot be determined, CalibrationError for a bad calibration, UsageError for a wrong request.
@@ -205,7 +208,8 @@ def _figures(fit: SyncFit, gate: GateDelay | None, truth: RigModel | None) -> Se
 
 
 def gate_delay(run: Path) -> GateDelay | None:
-    """Measure the gate's delay in a recorded run; None without markers, as planned times then follow from the light."""
+    """Measure the gate's delay in a recorded run. None for a run without markers: its planned times follow from the
+    light. Raises what `read_plan` does."""
     plan = read_plan(run)
     if plan.blanking is not None:
         return None

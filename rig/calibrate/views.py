@@ -67,7 +67,8 @@ def good_poses(config: RigConfig, board: Board, poses: int, at_m: float, seed: i
 
 
 def first_camera(config: RigConfig) -> Camera:
-    """A camera for placing boards: that of the config's calibration or, if it has no usable one, a rough one."""
+    """A camera for placing boards: that of the config's calibration or, if it has no usable one, a rough one. For the
+    latter the rig is opened."""
     if config.calibration is not None:
         try:
             return load_rig_model(config.calibration).camera
@@ -88,9 +89,8 @@ def take_live(
     defects: NDArray[np.bool_] | None = None,
     line: bool = True,
 ) -> None:
-    """Take views of a board moved from pose to pose, until as many as requested are good. It ends before that if
-    `choose` has no further pose, if no other pose would help (`LASTING`), or after MISSED_SHARE more poses than
-    requested.
+    """Take views of a board moved from pose to pose, until as many as requested are good. Ends early if `choose` has no
+    further pose, if no other pose would help (`LASTING`), or after MISSED_SHARE more poses than requested.
 
     choose: chooses the poses. ask: asks a person to move the board.
     exposures: per column, used in turn, so that the mirror is seen at several speeds (see `SpeedRotation`); empty: the
@@ -122,7 +122,8 @@ def take_live(
 
 
 def take_kept(session: Session, sources: ViewSources, defects: NDArray[np.bool_] | None = None) -> None:
-    """Take the views that need no live rig. defects: (rows, width), pixels that are not used."""
+    """Take the views that need no live rig. defects: (rows, width), pixels that are not used. Raises UsageError for
+    views of another board or rig, and for files that cannot be read."""
     for note in sources.notes:
         session.say(note)
     for folder in sources.sessions:
@@ -193,6 +194,6 @@ def refusal(
 
 
 def note_views(error: Degenerate, session: Session) -> None:
-    """Add the problems of single views as notes, unless the session has told them as the views came."""
+    """Add the problems of single views as notes, unless the session has a `tell`, which got them as the views came."""
     for name, why in session.refused.items() if session.tell is None else ():
         error.add_note(f"view {name}: {why}")

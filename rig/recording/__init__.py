@@ -1,5 +1,5 @@
-"""Recordings: files of SPB1 blocks (segments, docs/reference/spb1.md) and their index; writing, checking, repairing.
+"""Recordings: folders with segments (files of SPB1 blocks, docs/reference/spb1.md) and their index.
 
 Input: the blocks of a scan, or a recording. Output: a recording, or what it holds and what is damaged. `writer` writes
-and `open` opens them, `replay` plays them; `verify`, `repair`, `cut` and `compress` are the commands.
+recordings, `open` opens them, and `replay` plays them. `verify`, `repair`, `cut` and `compress` are commands.
 """

@@ -1,8 +1,9 @@
 """Reads every byte of a recording and finds which blocks are sound, what is damaged, and whether frames are missing.
 
-`check_segments` finds the sound blocks. `Continuity` finds gaps before and between them by their numbers. A gap
-at the end of a start, or at the beginning of a cut part, does not show there: `lost_ends` finds it in the index and
-the manifest. A `run` is here one start of the SPAD (frames without a pause), whose run id is in every block.
+`check_segments` finds the sound blocks. `Continuity` finds gaps before and between them by the numbers of blocks and
+frames. A gap at the end of a start, or at the beginning of a cut part, does not show in these numbers: `lost_ends`
+finds it in the index and the manifest. A `run` is here one start of the SPAD (frames without a pause). Its run id is in
+every block.
 
 The seal of a recording is one number in its manifest, of the frames of all its blocks in their order: the CRC-32 of the
 payload CRCs (u32, little-endian) in the trailers. Blocks of two recordings made by the same plan fit each other in all
@@ -53,10 +54,10 @@ _NOT_ITS_OWN: Final = "bring its own segments back, or let 'rig repair' take it 
 class SoundBlock:
     """A block with correct checksums. Only the checksum of the pixels may be missing (see `objection`).
 
-    entry: its index record. first_tick, last_tick: of its first and last frame; 0 if it has none. last_sweep: number of
-    scan markers up to its last frame. repeated: (first, last) of each stretch of frames whose ticks do not rise; they
-    count as missing. payload_crc: as its trailer states it. objection: why the block cannot be what was recorded; None
-    if it can.
+    entry: index record of the block. first_tick, last_tick: clock ticks of its first and last frame; 0 if it has no
+    frame. last_sweep: number of scan markers up to its last frame. repeated: (first, last) of each stretch of frames
+    whose ticks do not rise; they count as missing. payload_crc: as its trailer states it; 0 if it has none. objection:
+    why the block cannot be what was recorded; None if it can.
     """
 
     entry: bytes
@@ -89,7 +90,7 @@ Run = Sequence[SoundBlock]
 
 
 def check_segments(segments: Sequence[SegmentReader]) -> tuple[list[SoundBlock], list[str]]:
-    """Find all sound blocks, in order of their places; returns also a line for each damaged piece."""
+    """Find all sound blocks, in order of their places; returns also a line for each damaged piece of a segment."""
     if sum(segment.size for segment in segments) < _STEP_BYTES:  # threads would take longer to start
         found = list(map(_check, segments))
     else:
@@ -114,11 +115,11 @@ def merged_gaps(gaps: Iterable[RunGap]) -> list[RunGap]:
 
 @dataclass(slots=True)
 class Continuity:
-    """Gaps and problems between the blocks of a recording.
+    """Gaps and problems between the blocks of a recording. A gap is (number of the start, first frame, last frame).
 
     known: gaps that a repair found and noted; None if there was no repair.
     gaps: those that the recording tells of, because the device lost the frames or a repair noted them as missing.
-    missing: those that the recording does not tell of.
+    missing: those that the recording does not tell of. problems: one line each.
     """
 
     known: Collection[RunGap] | None
@@ -128,13 +129,14 @@ class Continuity:
 
     @property
     def lost(self) -> int:
-        """Number of frames in the gaps, each counted once."""
+        """Number of frames in `gaps`, each counted once."""
         return sum(last + 1 - first for _, first, last in merged_gaps(self.gaps))
 
     def follow(self, number: int, run: Run, *, is_part: bool) -> None:
         """Note the gaps before and between the blocks of a start, and what is wrong with their numbers and ticks.
 
-        number: of the start. is_part: whether the recording was cut from another one, so that it may begin anywhere.
+        number: number of the start. is_part: whether the recording was cut from another one, so that it may begin
+        anywhere.
         """
         first = run[0]
         self.gaps += [
@@ -344,8 +346,8 @@ def sealed(payload_crcs: Iterable[int], before: int = 0) -> int:
 
 
 def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> str | None:
-    """A line if these blocks are as many as the manifest says, but not those of its seal; None if they are, or if
-    nothing can be said: without a seal, before the run's end, or with other blocks than the manifest's."""
+    """A line if there are as many blocks as the manifest says, but not those of its seal. Otherwise None, as it is
+    without a seal and before the run's end."""
     crcs, recording = list(payload_crcs), manifest.get("recording") or {}
     told = recording.get(FRAMES_SEAL)
     if told is None or manifest.get("verdict") == UNFINISHED or recording.get("blocks") != len(crcs):
@@ -356,11 +358,11 @@ def seal_problem(payload_crcs: Iterable[int], manifest: Mapping[str, Any]) -> st
 
 
 def require_own_frames(recording: RunRecording) -> None:
-    """Raise DamagedRecordingError if the frames of a recording are not those of its manifest's seal, or in more or
-    fewer blocks than it says although no frame is missing.
+    """Raise DamagedRecordingError if a recording holds other frames than its run recorded: more blocks or frames, fewer
+    blocks with as many frames, or a different seal. Without a manifest nothing is checked.
 
-    Reads the trailers of its blocks, not their pixels. Compressed ones would have to be unpacked for that, so only `rig
-    verify` looks at theirs.
+    Reads the trailers of its blocks, not their pixels. Compressed blocks would have to be unpacked for that, so only
+    `rig verify` compares their seal.
     """
     manifest = read_manifest(recording.path) if recording.path.is_dir() else None
     if manifest is None:
@@ -389,7 +391,8 @@ def _other_blocks(recording: RunRecording, manifest: Mapping[str, Any]) -> str |
 
 
 def frames_never_told(recording: RunRecording, manifest: Mapping[str, Any]) -> int:
-    """Number of frames that a finished run recorded, in blocks of which neither index nor segments tell."""
+    """Number of frames that a finished run recorded, in blocks of which neither index nor segments tell; 0 if that is
+    unknown."""
     told, delivered = _told(manifest)
     if told is None or delivered is None or recording.problems or "cut" in manifest:
         return 0

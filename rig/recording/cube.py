@@ -42,7 +42,8 @@ Piece = tuple[int, NDArray[np.uint8]]
 class Cube:
     """Checked frames of whole maps. first_frame: number of the first map's first frame. maps: number of whole maps.
 
-    between: called with (first, end, step), yields those of frames first to end - 1 that exist, at most step at a time.
+    between: called with (first, end, step), yields frames first to end - 1 as pieces of at most `step`, without lost
+    ones.
     """
 
     path: Path
@@ -92,7 +93,8 @@ def _recorded(recording: RunRecording, run: RecordedRun, first: int, end: int, s
 
 
 def cube_columns(model: RigModel) -> int | None:
-    """Columns of the cube for which a model with `planes` was made; None if the model's commands are a mirror's."""
+    """Number of columns of the cube for which a model with `planes` was made; None if the model's commands are a
+    mirror's."""
     scanner = model.scanner
     if isinstance(scanner, PlaneTable) and np.array_equal(scanner.command, np.arange(len(scanner.command))):
         return len(scanner.command)

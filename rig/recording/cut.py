@@ -46,8 +46,8 @@ class Part:
 def cut(run: PathLike, out: PathLike, request: CutRequest | None = None, **changes: Any) -> dict[str, Any]:
     """Write a part of a recording to the folder `out` and return the manifest of the part (`rig cut`).
 
-    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. In
-      a range `A:B`, A may be left out for the first, B for the end; a single number means one map or frame.
+    request, changes: which part, as a `CutRequest` or by the names of its fields: `cut("run", "part", maps="0:2")`. A
+      range `A:B` ends before B; A may be left out for the first, B for the end; a single number means one map or frame.
     Raises UsageError for a part that does not exist or an `out` that cannot be used, DamagedRecordingError if the
     recording is damaged, RecordingError if frames or other files of the part cannot be written.
     """

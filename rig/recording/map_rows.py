@@ -1,6 +1,7 @@
 """Counts of single image rows of a recorded map: the same frames in the same columns as when the run counted them.
 
-The frames of a map are bound once; a row is then a few milliseconds of reading. The newest map's frames are kept.
+The frames of a map are bound to columns once. Reading a row then takes a few milliseconds. Only the frames of the map
+that was read last are kept.
 """
 
 from collections.abc import Sequence
@@ -87,7 +88,7 @@ class MapRows:
         return RowCounts(counts, n_frames, begin, end)
 
     def summed(self, number: int) -> NDArray[np.uint32]:
-        """Counts of a map's lit frames summed, uint32 (rows, width)."""
+        """Counts of a map's lit frames summed, uint32 (rows, width). Raises as `row` does."""
         plan = self.plan
         summed = np.zeros((plan.rows, plan.width), np.uint32)
         for bits, bins, x0 in self.frames(number).pieces:

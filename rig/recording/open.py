@@ -153,7 +153,8 @@ def _sweep_begins(recording: RunRecording, run: RecordedRun) -> Iterator[int]:
 
 
 def markers_seen(block: FrameBlock) -> NDArray[np.int64]:
-    """Scan markers of the start up to each frame, int64 (n,): 16 bits of its record, extended with the header's 32."""
+    """Number of scan markers of the start up to each frame, int64 (n,): the 16 bits of its record, extended by the
+    header."""
     sweep = block.header.sweep
     return np.asarray(sweep + ((block.records["sweep"].astype(np.int64) - sweep) & 0xFFFF))
 
@@ -167,11 +168,12 @@ def begins_sweep(block: FrameBlock) -> bool:
 class RunInfo:
     """One start of the SPAD, with frames first_frame to end_frame - 1 and maps first_map to end_map - 1 (None: none).
 
-    frames: number recorded. gaps: number of stretches missing between these and, if a repair found some, at the ends.
-    lost: number of frames in the gaps. width, height: pixels of a frame. frame_rate_hz: None if triggered from outside.
-    duration_s: from the first frame to the end of the last one or, without a rate, to the start of the last block.
-    first_frame_utc: when the exposure of the first frame began, as text; None if the recording does not say.
-    utc_uncertainty_s: how far that time may be off; None if it is not known, or if a simulated rig ran in its own time.
+    frames: number recorded. gaps: number of stretches of frames missing between the recorded ones and, if a repair
+    found some, at the ends. lost: number of frames in the gaps. width, height: pixels of a frame. frame_rate_hz: None
+    if triggered from outside. duration_s: time from the first frame to the end of the last one or, without a rate, to
+    the start of the last block. first_frame_utc: when the exposure of the first frame began, as text; None if the
+    recording does not say. utc_uncertainty_s: how far that time may be off; None if it is not known, or if a simulated
+    rig ran in its own time.
     """
 
     run_id: int
@@ -197,9 +199,10 @@ class RecordingInfo:
     """Contents of a recording.
 
     verdict: the one in the run's manifest. segments, compressed: number of all segments and of the compressed ones.
-    bytes: size of all segments on the disk. maps: number of whole maps. config: name of the config, devices: names by
-    slot, versions: of the software, all at the time of recording. Without a manifest, verdict and config are None,
-    devices and versions empty. problems: one line each, as far as a look at a few blocks shows.
+    bytes: size of all segments on the disk. maps: number of whole maps. config: name of the config. devices: names of
+    the devices by slot. versions: versions of the software. All three are those at the time of recording. Without a
+    manifest, verdict and config are None, devices and versions empty. problems: one line each, as far as a look at a
+    few blocks shows.
     """
 
     folder: Path

@@ -42,7 +42,8 @@ class Repair:
 def repair(run: PathLike) -> Repair:
     """Make a damaged or unfinished recording whole (`rig repair`). No frame is changed or thrown away.
 
-    Raises UsageError if there is no recording or its run still goes on, RecordingError if it cannot be written.
+    Raises UsageError if there is no recording, its run still goes on or a segment is a link, RecordingError if it
+    cannot be written.
     """
     folder = Path(run)
     if is_held(folder / INDEX_FILE):

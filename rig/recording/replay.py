@@ -1,8 +1,8 @@
 """Prepares a recording to be played like a scan: its plan, and its starts of the SPAD (frames without a pause).
 
-Frames are bound by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and each start is
-played as one start. So a map is made from exactly the same frames in the same order, at any speed. Scanner, laser and
-sync source are played too, unless emulated or real ones take part.
+Frames are bound to columns by the plan with which they were taken (`plan.yaml`), never by a newly compiled one, and
+each start is played as one start. So a map is made from exactly the same frames in the same order, at any speed.
+Scanner, laser and sync source are played too, unless emulated or real ones take part.
 """
 
 import itertools
@@ -60,7 +60,7 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
     """Make the config of the rig that plays a recording. Raises UsageError if there is no recording that can be played,
     or for a wrong request; DamagedRecordingError if the recording's manifest or other files are damaged.
 
-    request: its settings of the estimate, where given, replace those of the recording.
+    request: options of the replay. Settings of the estimate that it gives replace those of the recording.
     others: rig whose world, scanner, laser and sync source take part; None to use the recorded ones.
     """
     try:
@@ -103,8 +103,8 @@ def replay_config(run: Path, request: ReplayRequest, others: RigConfig | None = 
 def replay_plan(
     spad: SpadArray, recording: RunRecording, scan: ScanConfig, model: RigModel | None
 ) -> tuple[ScanPlan, SpadTiming]:
-    """The plan with which the frames were taken, adapted to the calibration `model`, and the timing of the SPAD, which
-    is configured here.
+    """Return the plan with which the frames were taken, adapted to the calibration `model`. Configures the SPAD with
+    it, and returns the SPAD's timing too.
 
     Raises UsageError as `read_plan` does and for a calibration that does not fit the plan, DamagedRecordingError if the
     frames differ in size from the plan's, and DeviceError as `SpadArray.configure` does.
@@ -136,10 +136,10 @@ def _begun_with(run: Path) -> str | None:
 class ReplayFacts:
     """Facts about a recording for its replay, as `rig.scan.scan.LiveFacts` has them for a live scan.
 
-    maps: number of maps to take, None for all (ENDLESS in a loop). starts: those of the SPAD, one after the other.
-    learned: in a part cut from a recording, the state of the estimator for each of its maps; empty if the estimator is
-    to learn again. Raises UsageError if there is no whole map, or fewer than `maps` and no loop;
-    DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
+    maps: number of maps to take, None for all (ENDLESS in a loop). starts: yields the starts of the SPAD to be played,
+    without end if the replay loops. learned: in a part cut from a recording, the state of the estimator for each of its
+    maps; empty if the estimator is to learn again. Raises UsageError if there is no whole map, or fewer than `maps` and
+    no loop; DamagedRecordingError if a start of the SPAD is missing or a kept state is unreadable.
     """
 
     command = "replay"
@@ -172,7 +172,7 @@ class ReplayFacts:
 
     @property
     def report(self) -> PaceReport:
-        """Report on how late blocks came by the clock of the replay."""
+        """Report on how late blocks came, compared with the clock of the replay."""
         return self._spad.pace.report
 
     @property
@@ -225,8 +225,9 @@ class ReplayFacts:
 class RecordedStart:
     """One start of the SPAD in a recording.
 
-    begin: the sweep with which its whole maps begin. first_map: number of the first of these maps in the recording.
-    sweeps: how many whole maps. gone: frames at the start's ends that the manifest mentions but no block contains.
+    number: number of the start. begin: the sweep with which its whole maps begin. first_map: number of the first of
+    these maps in the recording. sweeps: how many whole maps. gone: frames at the start's ends that the manifest
+    mentions but no block contains.
     """
 
     number: int

@@ -73,7 +73,7 @@ class OpenSegment:
         return offset
 
     def write(self, block: FrameBlock, offset: int, staging: Staging) -> int:
-        """Write a block at its place; returns the CRC of its payload. The block's memory must not change until then.
+        """Write a block at its place; returns the CRC of its payload. The block's memory must not change meanwhile.
         Raises OSError."""
         pieces, crc = _pieces(block, staging)
         while pieces:

@@ -56,8 +56,9 @@ class Verification:
     """Verdict on a recording, with its evidence.
 
     runs: number of starts of the SPAD. blocks, frames, bytes: number of sound blocks, of frames and bytes in them (with
-    padding). lost: number of frames that the device lost or a repair noted as missing. gaps: their ranges, (number of
-    the start, first, last). problems: one line each. run: verdict of the run that was recorded, None if unknown.
+    padding). lost: number of frames that the device lost or a repair noted as missing. gaps: ranges of these frames,
+    (number of the start, first, last). problems: one line each. run: verdict of the run that was recorded, None if
+    unknown.
     ended: why the recording ended before the run; None if it did not.
     """
 

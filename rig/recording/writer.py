@@ -144,7 +144,7 @@ class Recording:
         return self._pool.submit(self._write, block, placed, offset)
 
     def holds(self, ring: BlockRing) -> int:
-        """Blocks of the ring that are written at a time."""
+        """Number of blocks of the ring that `write_from` holds at a time."""
         return max(1, min(WRITERS, ring.slots // 4))
 
     def write_from(self, reader: RingReader) -> None:
@@ -301,7 +301,7 @@ class WritesBlocks(Protocol):
 
     @property
     def bytes(self) -> int:
-        """Bytes that these blocks take."""
+        """Bytes of the blocks that are written and count."""
         ...
 
     @property
@@ -334,7 +334,8 @@ def _reason(error: BaseException) -> str:
 class Recorder:
     """Records the blocks of one start of the SPAD. `thread` ends once the last one is written.
 
-    reader: holds as many blocks as `recording.holds` says. on_failure: called on `thread` when `error` is set.
+    reader: holds as many blocks as `recording.holds` says. error: what was raised; None if nothing was. on_failure:
+    called on `thread` once `error` is set.
     """
 
     def __init__(self, reader: RingReader, recording: WritesBlocks, on_failure: Callable[[], None]) -> None:

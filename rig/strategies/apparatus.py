@@ -21,12 +21,13 @@ from drivers.interfaces import World
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limit of a measurement. time_s: from the beginning of the first exposure to the end of the last one."""
+    """Limit of a measurement. time_s: time from the beginning of the first exposure to the end of the last one."""
 
     time_s: float
 
     def frames(self, frame_s: float) -> int:
-        """Number of whole frames in the time, also if it is too short by a millionth of a frame because of rounding."""
+        """Number of whole frames in the time. A time that rounding made a millionth of a frame too short counts as
+        whole."""
         return math.floor(self.time_s / frame_s * (1 + 1e-9) + 1e-6)
 
 
@@ -71,19 +72,18 @@ class Apparatus(Protocol):
     def spots(
         self, rows: NDArray[np.int64], columns: NDArray[np.int64], frames: int, brightness: float = 1.0
     ) -> NDArray[np.uint32]:
-        """Light single spots one after the other, each with the whole power for some frames of the SPAD. Returns
-        (spots, width), the counts of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,).
-        brightness: share of the power, above 0 and at most 1.
-        """
+        """Light single spots one after the other, each for some frames of the SPAD. Returns (spots, width), the counts
+        of each spot's own row. rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power,
+        above 0 and at most 1."""
         ...
 
     def pulse_times(self, pulses: int, bin_s: float) -> PulseTimes:
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
         pixel detects after each pulse.
 
-        The pulses have the mean power of the source, which is at the camera. Light from a distance r arrives 2 r / c
-        after the middle of its pulse has left. A gate switches the pixels on only while light from within the depth
-        range can arrive.
+        bin_s: width of a bin of the result in seconds. The pulses have the mean power of the source and leave from the
+        camera. Light from a distance r arrives 2 r / c after the middle of its pulse has left. A gate switches the
+        pixels on only while light from within the depth range can arrive.
         """
         ...
 
@@ -91,7 +91,7 @@ class Apparatus(Protocol):
         """Take one image with each of two conventional cameras, in ambient light only: (2, rows, width).
 
         The second camera stands beside the first, as far left or right as the light source, and looks in the same
-        direction. Both are without the narrow filter.
+        direction. Neither has the narrow filter for the light of the source. exposure_s: at least `camera_frame_s`.
         """
         ...
 
@@ -104,11 +104,13 @@ class MakesApparatus(World, Protocol):
         self, *, rows: NDArray[np.int64], columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
         seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
     ) -> Apparatus:  # fmt: skip
-        """Make an apparatus at time 0. Light transport is kept, so another one for the same rows and columns is quick.
+        """Make an apparatus at time 0. Light transport is kept, so another apparatus for the same rows and columns is
+        made quickly.
 
-        rows: image rows to measure, ascending. columns: their number. command_range: first and last command of the
+        rows: image rows to measure, ascending. columns: number of columns. command_range: first and last command of the
         mirror; as in a scan, column c is the line at the command first + (c + 0.5) (last - first) / columns. power_w:
-        mean power of the source. seed: of all random draws. depth_range_m: range for which the gate of pulses is open.
-        Raises ValueError for impossible values, and DeviceError for a scene that moves.
+        mean power of the source. rule: how the columns that are lit share it. seed: decides all random draws.
+        depth_range_m: range for which the gate of pulses is open. spad_frame_s: see `Apparatus`. Raises ValueError for
+        impossible values, and DeviceError for a scene that moves.
         """
         ...

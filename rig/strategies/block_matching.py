@@ -44,8 +44,8 @@ MOST_EXPOSURES: Final = 64
 class Matches(NamedTuple):
     """Best hypothesis of each pixel, float32 (rows, width).
 
-    place: fractional index of the hypothesis, NaN where the block shows nothing. sd: standard deviation of the place if
-    the hypothesis is right. confidence: probability that it is right, 0 to 1.
+    place: fractional index of the hypothesis, NaN where the block shows nothing. sd: standard deviation of the place,
+    in hypotheses, if this one is right. confidence: probability that it is right, 0 to 1.
     """
 
     place: Float32
@@ -54,7 +54,8 @@ class Matches(NamedTuple):
 
 
 def bands(rows: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Pairs of slices: of `rows`, the rows that are matched together; and of these, the rows whose result is kept.
+    """Parts of `rows` to match one after the other. Each part is two slices. The first selects, from `rows`, the rows
+    to match together. The second selects, from these, the rows whose result is to be kept.
 
     Rows that are matched together are neighbours in the picture. Half a block of rows on either side is added to those
     whose result is kept, where there are such rows.
@@ -75,7 +76,8 @@ def exposed(
     """Take a picture (...) within a time, as the sum of exposures that do not saturate.
 
     take(n, exposure_s) returns n pictures (n, ...). The first one has the shortest exposure, frame_s, and shows how
-    long the others may be. time_s: time for all of them, at least frame_s.
+    long the others may be. If the time is too short for two, a single picture takes all of it. time_s: time for all
+    pictures, at least frame_s.
     """
     if time_s < 2 * frame_s:
         return np.asarray(take(1, max(time_s, frame_s))[0], np.float32)
@@ -117,7 +119,7 @@ LEAST_LEFT: Final = np.float32(1e-5)
 def log_bayes_factor(left: Float32, independent: float) -> Float32:
     """Logarithm of the Bayes factor B of the module's docstring.
 
-    left: 1 - r^2, 0 to 1. n: number of independent values in a block.
+    left: 1 - r^2, 0 to 1. independent: number n of independent values in a block; less than 3 counts as 3.
     """
     n = max(independent, 3.0)
     return np.asarray(0.5 * (n - 2) * np.log1p(n) - 0.5 * (n - 1) * np.log1p(n * left), np.float32)
@@ -143,7 +145,7 @@ def best_match(
     left: Float32, evidence: Float32, independent: float, step_px: float, at: NDArray[np.int64] | None = None
 ) -> Matches:
     """The best hypothesis of each pixel. left, evidence: results of `match`. step_px: pixels of disparity between two
-    hypotheses. at: hypotheses (rows, width) that are judged instead of the best ones.
+    hypotheses. at: indices (rows, width) of the hypotheses that are judged instead of the best ones.
 
     A block over a depth edge matches the surface with more contrast, while its middle may lie on the other surface. So
     if confident answers within a block are more than `EDGE_PX` apart, the confidence is halved.

@@ -1,7 +1,7 @@
 """Dots: one picture of a known random pattern, matched block by block along the row, as in the first Kinect.
 
 The projector shows dots at random places. For each of many inverse depths, the calibrated columns tell how the pattern
-would look on surfaces at this depth. The picture is compared with that block by block
+would look on surfaces at this depth. The picture is compared with these block by block
 (`rig.strategies.block_matching`). The same pattern is shown all the time, so one exposure is enough, even for a scene
 that moves.
 
@@ -54,8 +54,7 @@ class Dots:
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
         """See `Strategy`. All of the time is used for one picture. If one exposure of the conventional camera would
-        saturate, several are added. rng_seed: of the pattern.
-        """
+        saturate, several are added. rng_seed: seed of the pattern."""
         frame_s = apparatus.spad_frame_s if self.camera == "spad" else apparatus.camera_frame_s
         frames = budget.frames(frame_s)
         if frames < 1:

@@ -4,10 +4,11 @@ A photon that arrives at time t after the middle of its pulse comes from the dis
 compute the depth of a pixel from the times of its photons:
 
 - first photon (Kirmani et al., "First-photon imaging", Science 343, 2014, without its smoothing over neighbours): the
-  time of the very first photon is the answer. Further photons are not used, so its error does not fall with time.
+  time of the very first photon is the answer. Further photons are not used, so the error does not fall with a longer
+  measurement.
 - peak: the first photons of all pulses make a histogram. The answer is where its matched filter is largest.
-- Coates (J. Phys. E 1, 1968): the same after correction of the pile-up: after its first photon a pixel is blind until
-  the next pulse.
+- Coates (J. Phys. E 1, 1968): as peak, after correction of the pile-up. Pile-up arises because a pixel, after its first
+  photon, is blind until the next pulse.
 - gamma (Satat, Tancik and Raskar, "Towards photography through realistic fog", ICCP 2018): light of the fog is fitted
   by a gamma distribution a t^b exp(-c t), and the peak is sought in the light that exceeds it. Light that is scattered
   once follows the lidar equation, which is this distribution with b = -2 and c = speed of light x extinction. Pile-up
@@ -17,7 +18,8 @@ If a pulse gives F photons from the fog before a surface and S from the surface,
 detected comes from the surface with the probability exp(-F) (1 - exp(-S)) / (1 - exp(-F - S)).
 
 Confidence is the probability that the answer is within 2 % of the depth. It is the probability that the peak is a
-surface (`rig.strategies.photon_times`), times the probability that its error is small enough.
+surface (`rig.strategies.photon_times`, or `first_photons` for a first photon), times the probability that its error is
+small enough.
 """
 
 import math
@@ -47,7 +49,7 @@ Method = Literal["first-photon", "peak", "gamma"]
 
 @dataclass(frozen=True, slots=True)
 class FlashLidar:
-    """A flash lidar. method: how it computes the depth, see above. coates: whether pile-up is corrected."""
+    """A flash lidar. method: how it computes the depth, see the module. coates: whether pile-up is corrected."""
 
     name: str
     sentence: str

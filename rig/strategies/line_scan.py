@@ -6,7 +6,7 @@ fewer frames than columns, the line passes several columns within a frame, as wi
 of them are lit together. Several lines share the light. Each of them has fewer places to go to, so each place gets more
 frames.
 
-The conventional camera (`LineCamera`) takes an image for each place of the line, which stands still meanwhile. Each
+The conventional camera (`LineCamera`) takes an image for each place of the line. The line stands still meanwhile. Each
 pixel's median over all images is subtracted. On every row the brightest pixel is then refined to the centroid of the
 pixels beside it (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996). Noise is measured
 in the images themselves.
@@ -48,7 +48,8 @@ def shares(frames: int, places: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class LinePlaces:
-    """Places at which a line stands. of: place of each column, (columns,). commands: their middles, (places,)."""
+    """Places at which a line stands. of: number of the place of each column, (columns,). commands: mean command of the
+    columns of each place, (places,)."""
 
     of: NDArray[np.int64]
     commands: Float64
@@ -65,14 +66,16 @@ class LinePlaces:
 
 
 def places_of(commands: Float64, most: int) -> LinePlaces:
-    """At most `most` places. Each has the same number of neighbouring columns, except the last one."""
+    """Group columns into at most `most` places. Each has the same number of neighbouring columns; the last may have
+    fewer."""
     together = -(-len(commands) // most)
     of = np.arange(len(commands)) // together
     return LinePlaces(of, np.bincount(of, weights=commands) / np.bincount(of))
 
 
 def windowed(volume: NDArray[np.uint32], geometry: SweepGeometry, first: int) -> NDArray[np.uint32]:
-    """The search windows of images (n, rows, width) of columns `first` to `first + n - 1`: (n, rows, window)."""
+    """The search windows of images (n, rows, width) of columns `first` to `first + n - 1`: (n, rows, window), 0 beyond
+    the right edge."""
     x = geometry.x0[first : first + len(volume), None, None] + np.arange(geometry.window)
     beyond = max(0, int(x.max()) + 1 - volume.shape[2])
     padded = np.pad(volume, ((0, 0), (0, 0), (0, beyond))) if beyond else volume
@@ -93,7 +96,7 @@ class LineScan:
 
     @property
     def sentence(self) -> str:
-        """One sentence that says what it does."""
+        """One sentence that says what the strategy does."""
         many = "a line" if self.lines == 1 else f"{self.lines} lines at once"
         filtered = "" if self.filter == "none" else " with a 5 x 5 median"
         return f"SPAD array and {many} of light, the stripe found by the estimator {self.estimator}{filtered}."
@@ -174,7 +177,8 @@ class LineCamera:
     clear_px: float = 0.3
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time."""
+        """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time, but at
+        most one for each column."""
         most = budget.frames(apparatus.camera_frame_s)
         if most < LEAST_PLACES:
             raise TooShort(f"{self.name} needs {LEAST_PLACES * apparatus.camera_frame_s * 1e3:.3g} ms")
@@ -198,10 +202,11 @@ def peak_centroids(images: NDArray[np.uint16], geometry: SweepGeometry, full_sca
 
     The median of each pixel over all images is subtracted: it is ambient light and offset. The position is the centroid
     of the brightest pixel within the search window (the middle one, if several in a row are saturated) and CENTROID_PX
-    pixels on each side. The noise of a dark pixel is its median absolute deviation over the images. A bright pixel has
-    shot noise too, which is learned from the growth of the variance with brightness. Confidence is the probability that
-    noise has made no other pixel of the window so bright, and that no other place on the row is as bright. x_sd_px is
-    the error of the centroid because of noise, at least 0.05 px.
+    pixels on each side. The noise of a dark pixel is the standard deviation that follows from its median absolute
+    deviation over the images. A bright pixel has shot noise too: its brightness is added to the variance, as if a grey
+    level were a photon. Confidence is the probability that noise has made no other pixel of the window so bright, and
+    that no other place on the row is as bright. x_sd_px is the error of the centroid because of noise, at least 0.05
+    px.
     """
     columns, rows, width = images.shape
     dark = np.median(images, axis=0).astype(np.float32)

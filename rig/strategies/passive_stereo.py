@@ -1,8 +1,8 @@
 """Passive stereo: two cameras in ambient light, matched by OpenCV's semi-global matcher (StereoSGBM).
 
 The second camera stands level with the first, as far left or right as the light source of other strategies, so the
-baseline is the same. A point at depth z
-is seen with a disparity d = b f / z. An error dd of the disparity becomes an error of the depth of
+baseline b is the same. With the focal length f in pixels, a point at depth z is seen with a disparity d = b f / z. An
+error dd of the disparity becomes the depth error
 
     dz = z^2 / (b f) dd.
 
@@ -50,8 +50,8 @@ class Rectified(NamedTuple):
     """Rectification of the pictures of two cameras.
 
     focal_baseline: b f in pixels times metres, positive if the second camera stands on the right of the first, else
-    negative. maps: for `cv2.remap`, of both cameras; None if the pictures need no change. matrix: (3, 3) of the
-    rectified camera, which looks in the same direction.
+    negative. maps: arguments of `cv2.remap` for each camera; None if the pictures need no change. matrix: (3, 3),
+    camera matrix of the rectified first camera. It looks in the same direction as before.
     """
 
     focal_baseline: float
@@ -104,7 +104,8 @@ class PassiveStereo:
 
 
 def depth_of_pair(pair: Float32, geometry: ColumnGeometry) -> Answer:
-    """Depth from two pictures (2, rows, width), for the pixels of the first camera."""
+    """Depth from two pictures (2, rows, width), for the pixels of the first camera. Raises UsageError as `rectified`
+    does."""
     how = rectified(geometry.model)
     rows = geometry.rows
     if how.maps is not None:

@@ -71,8 +71,9 @@ def surfaces(
     """The surface that each pixel sees, found as the largest peak of its histogram; arrays (rows x width,).
 
     seen: its histogram is (rows, width, bins). sigma_s: standard deviation of the pulse. between_s: first and last time
-    at which light of a surface can arrive, (rows x width,) each. fog: whether the background is the fitted light of
-    fog; otherwise it is constant. coates: whether pile-up is corrected.
+    at which light of a surface can arrive, (rows x width,) each. fog: whether the peak is sought above the fitted light
+    of fog; otherwise above a constant background. Time and confidence of the peak follow from the fitted light in both
+    cases. coates: whether pile-up is corrected.
     """
     bins = seen.counts.shape[-1]
     counts = np.ascontiguousarray(seen.counts).reshape(-1, bins)
@@ -111,9 +112,9 @@ class Nodes(NamedTuple):
     """Intervals of time, for the fit of a background.
 
     of_bin: int64 (bins,), the interval of each bin. share: (bins,), place of the bin in its interval, 0 to 1. edges:
-    (number + 1, 3), the terms 1, log t and -t at the ends of intervals; log t and -t are 0 at the first end, and -t is
-    -1 at the last. middle: (number, 3), means of the terms over the bins of an interval. used: (number,), 1 for
-    intervals with a bin, else 0.
+    (number + 1, 3), the terms 1, log t and -t at the ends of intervals. log t and -t are shifted to 0 at the first end,
+    and -t is scaled to -1 at the last. middle: (number, 3), means of the terms over the bins of an interval. used:
+    (number,), 1 for intervals with a bin, else 0.
     """
 
     of_bin: Whole

@@ -6,11 +6,12 @@ grid that is as fine as the time allows, at best on every row and column. Each s
 rows of the picture are measured, they get their share of the time. Rows without spots have the depths of the nearest
 row with spots.
 
-`first-bright` goes along the row from the far end and takes the first bright place, since fog sends back light in front
-of the surface, but nothing does behind it. A place is five pixels. It is bright if it has more counts than ambient
-light and dark counts explain; the threshold allows one wrong place in a hundred rows. From there on, within the width
-of a spot, the brightest place is the answer. `likelihood` uses the estimator of this name on the same counts. It learns
-how much light fog and surfaces send back, and takes into account that a pixel counts at most one photon per frame.
+There are two ways to find the spot on its row. `first-bright` goes along the row from the far end and takes the first
+bright place, since fog sends back light in front of the surface, but nothing behind the surface does. A place is five
+pixels. It is bright if it has more counts than ambient light and dark counts explain; the threshold allows one wrong
+place in a hundred rows. From there on, within the width of a spot, the brightest place is the answer. `likelihood` uses
+the estimator of this name on the same counts. It learns how much light fog and surfaces send back, and takes into
+account that a pixel counts at most one photon per frame.
 """
 
 import math
@@ -50,7 +51,8 @@ frames."""
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Spots of a scan. rows: indices of measured rows. columns: of the projector. frames: number for each spot."""
+    """Spots of a scan. rows: indices of measured rows. columns: numbers of the projector's columns. frames: number of
+    frames for each spot."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
@@ -115,7 +117,7 @@ def choose_brightness(apparatus: Apparatus, geometry: ColumnGeometry, rng: np.ra
     """The least of BRIGHTNESS at which a surface is seen, found with test spots at random places, one frame each.
 
     First, ambient light is measured. Of the pixels within the search windows that it does not make fire, at least the
-    share LIT must fire because of the spot.
+    share LIT must fire because of the spot. If no brightness suffices, the full power is chosen.
     """
     sweep = geometry.sweep()
     x = np.arange(geometry.shape[1])

@@ -1,9 +1,9 @@
 """The interface of a strategy, that is, of a way to measure depth, and the search for a strategy by its name.
 
 A strategy chooses what is lit and for how long, gets what the camera reads (`rig.strategies.apparatus`), and answers
-with a depth for each pixel. An entry point of the group `spadrig.strategies` has the strategy's name and loads the
-object, most simply one of a frozen dataclass. So another package can add a strategy. All that a strategy knows of the
-rig is its `ColumnGeometry`: where a column of light lies in space.
+with a depth for each pixel. Strategies are entry points of the group `spadrig.strategies`, so another package can add
+one. The name of the entry point is that of the strategy; it loads the strategy itself, most simply an instance of a
+frozen dataclass. All that a strategy knows of the rig is its `ColumnGeometry`: where a column of light lies in space.
 """
 
 from dataclasses import dataclass, replace
@@ -60,7 +60,7 @@ class Strategy(Protocol):
 
     @property
     def sentence(self) -> str:
-        """One sentence that says what it does."""
+        """One sentence that says what the strategy does."""
         ...
 
     @property
@@ -81,13 +81,14 @@ class Strategy(Protocol):
     def measure(self, apparatus: Apparatus, geometry: "ColumnGeometry", budget: Budget, rng_seed: int) -> Answer:
         """Measure once. Raises `TooShort` if this takes longer than the budget allows, before any light is sent.
 
-        rng_seed: of all random choices of the strategy itself; the apparatus has its own.
+        rng_seed: seed of all random choices of the strategy itself; the apparatus has a seed of its own.
         """
         ...
 
 
 class ColumnGeometry:
-    """Places of the light of each column, for the rows that are measured. Columns are fractional, centres at integers.
+    """Geometry of the light of each column, for the rows that are measured. Column numbers may be fractional; whole
+    numbers are the centres of columns.
 
     For each pixel, the inverse depth is interpolated linearly between two columns. That is exact to 3e-5 of the depth
     for 500 columns over the picture. `depth_m` and `column_of` are inverse to each other.
@@ -98,7 +99,8 @@ class ColumnGeometry:
     ) -> None:
         """Make the geometry of a calibrated rig.
 
-        commands: of the mirror at the centres of columns, (columns,). rows: image rows that are measured, ascending.
+        commands: mirror commands at the centres of columns, (columns,). depth_range_m: near and far end. rows: image
+        rows that are measured, ascending.
 
         Raises UsageError for light that is bent (it bows, or rows are exposed one after the other), for fewer than two
         columns, for rows that the camera does not have, and as `sweep_geometry` does.
@@ -149,7 +151,8 @@ class ColumnGeometry:
         return len(self.commands)
 
     def sweep(self, commands: Float64 | None = None) -> SweepGeometry:
-        """Rays, planes and windows of the measured rows, for the estimators. commands: (n,), instead of its own."""
+        """Rays, planes and windows of the measured rows, for the estimators. commands: those of the sweep's columns,
+        (n,); None for this geometry's own."""
         whole = self._whole if commands is None else sweep_geometry(self.model, commands, self.depth_range_m)
         return _rows_of(whole, self.rows)
 

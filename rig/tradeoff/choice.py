@@ -68,7 +68,8 @@ class Choice:
 
 
 def wish_of(time_budget: str | None, error: str | None, of: str) -> Wish | None:
-    """The wish in the options; None if neither time nor error is given. Raises UsageError with all problems."""
+    """The wish from texts such as '20 ms' and '0.1 px', of which one may be given; None without either. Raises
+    UsageError with all problems."""
     problems = []
     time_ms = error_px = None
     if of not in ("sensor", "compute"):

@@ -45,7 +45,8 @@ class ReportsEffects(World, Protocol):
         ...
 
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
-        """Choose the simulated effects for columns of `exposures` frames of that exposure, at that power."""
+        """Choose the simulated effects for columns of `exposures` frames, each exposed for `exposure_s`, at
+        `power_w`."""
         ...
 
     def flux_row(self, row: int, command: float, power_w: float, exposure_s: float) -> Mapping[str, Array]:
@@ -66,7 +67,7 @@ class Effect:
     share: share of all detected photons.
     changed_decisions_bound: largest share of an estimator's answers that can differ without the effect, whatever the
       estimator; None if there is no bound.
-    cost_us_per_frame: of one thread; None if it is part of another effect.
+    cost_us_per_frame: computing time on one thread; None if it is part of another effect.
     stripe_error_change_px, stripe_error_change_sd_px: how much larger the mean stripe error is with the effect than
       without it, and the standard error of this change; None if not known.
     basis: 'trial' if the change was measured in a pair of trial scans, 'bound' if it is the bound of an effect that is
@@ -89,7 +90,7 @@ class SceneEffects:
     """The effects of a scene.
 
     planned_for: the largest values for which the choice of effects holds: power_w of all lines together, exposure_s of
-      a column's frames together, and exposures, the number of these frames.
+      a column's frames together, and exposures, the number of these frames, which may be one more than planned.
     changed_decisions_bound: largest share of an estimator's answers, 0 to 1, that all effects left out can
       change together.
     """
@@ -131,8 +132,9 @@ def scene_effects(
 def flux_row(config: Config = SIMULATED, *, scene: str | None = None, row: int | None, column: int | None) -> Flux:
     """Noise-free photons per exposure of one image row while the line is at a column's centre (`rig effects --row`).
 
-    x_px: pixels (width,); total; and by name the part of each effect of light and dark counts, zeros for effects that
-    are off. The parts add up to the total. Raises UsageError for a row or column that does not exist.
+    Returns x_px: pixels (width,); total: photons of each; and by its name the part of each effect of light or dark
+    counts, zeros for an effect that is off. The parts add up to the total. Raises UsageError for a row or column that
+    does not exist.
     """
     if row is None or column is None:
         raise UsageError("the flux is that of one image row at one column of the scan; give both `row` and `column`")

@@ -147,7 +147,7 @@ def _notes(rows: Sequence[TradeoffRow], ci95_by: str) -> list[str]:
 
 
 def colour_of(estimator: str) -> str:
-    """Colour of an estimator, which is the same in every picture."""
+    """Colour of an estimator in every picture. Estimators that are not in `COLOURS` share one."""
     return COLOURS.get(estimator, OTHER_COLOUR)
 
 

@@ -34,8 +34,8 @@ class RowLight:
 
     before, behind: light of each pixel if it lies before the stripe, and if it lies behind; above 0 (dark counts).
     strength: brightness of a stripe of the same reflectance at each pixel, in any unit.
-    position: of the stripe, in pixels. stripe: its photons, summed across it. sigma_px: width of the Gaussian line.
-    first, last: first and last pixel of the search, around the position.
+    position: of the stripe, as a fractional index of these arrays. stripe: its photons, summed across it.
+    sigma_px: width of the Gaussian line. first, last: indices of the first and the last pixel of the search.
     """
 
     before: Array
@@ -48,7 +48,7 @@ class RowLight:
     last: float
 
     def flux(self, position: Array) -> Array:
-        """Expected light (positions, pixels) if the stripe were at these positions."""
+        """Expected light (positions, pixels) if the stripe were at these positions (positions,)."""
         pixel = np.arange(len(self.before), dtype=np.float64)
         away = pixel - np.asarray(position)[:, None]
         strength = np.interp(position, pixel, self.strength) / max(
@@ -90,7 +90,7 @@ CLEAR_SIGMAS = 4.0
 
 
 def scene_lights(config: RigConfig, *, rows: int = 200, seed: int = 0) -> list[RowLight]:
-    """Light of up to `rows` rows of a config's scene, drawn at random over columns; the same for the same seed.
+    """Light of up to `rows` rows of a config's scene, at random columns. The same seed gives the same rows.
 
     Halo, drops and ambient light are those at the true position. Rows whose stripe is split, hidden or outside the
     depth range are left out. Raises UsageError without a world, a calibration or any stripe, and for a rig of several
@@ -139,7 +139,8 @@ def _lights(
 
 
 def row_light(parts: Mapping[str, Array], geometry: SweepGeometry, row: int, column: int) -> RowLight | None:
-    """Light of one row from its parts by effect, (width,) photons per exposure each; None without a stripe of its own.
+    """Light of one row from its parts by effect, (width,) photons per exposure each; None if the stripe is too dim,
+    split or outside its search window.
 
     The haze of places that the object hides is extrapolated with an exponential fitted to the haze before it.
     """

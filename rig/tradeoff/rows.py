@@ -59,10 +59,11 @@ class TradeoffRow:
     """A setting in one scene and fog, over all repeats: errors relative to the world's truth, and times.
 
     fog: a visibility or 'clear'; None for the scene's own fog.
-    sensor_ms: of one map, with dark frames and fly-back.
-    compute_ms: of a map after the first, with counting and everything else.
-    mean_abs_px: over every (row, column) with a true stripe; a missing answer counts as `MISSING_PX`.
-    within_1px, missing: shares of the true stripes.
+    sensor_ms: time of the sensor for a map, with dark frames and fly-back.
+    compute_ms: computing time of a map after the first, with counting and everything else.
+    mean_abs_px: mean |error| of stripes over every (row, column) with a true stripe; a missing answer counts as
+    `MISSING_PX`.
+    within_1px, missing: shares of the true stripes with an answer within 1 px, and without an answer.
     depth_mm: mean depth error; None if no pixel has a depth.
     ci95: confidence interval of mean_abs_px, over repeats or else over blocks of the map.
     local_sd_px: standard deviation of the errors of answers within LOCAL_PX, from the median |error|; None without any.
@@ -186,14 +187,14 @@ _T = {1: 12.7062, 2: 4.3027, 3: 3.1824, 4: 2.7764, 5: 2.5706}
 
 
 def repeats_interval(means: Sequence[float]) -> Interval:
-    """Interval of the mean of two or more independent means of absolute errors, so never below zero."""
+    """95 % interval of the mean of two or more independent means of absolute errors. It is cut off at 0."""
     half = t_quantile(len(means) - 1) * statistics.stdev(means) / math.sqrt(len(means))
     middle = statistics.fmean(means)
     return max(0.0, middle - half), middle + half
 
 
 def blocks_interval(sums: NDArray[np.float64], numbers: NDArray[np.int64], seed: int = 0) -> Interval:
-    """Interval of the mean error sum(sums) / sum(numbers).
+    """95 % interval of the mean error sum(sums) / sum(numbers).
 
     sums, numbers: (blocks,), sum and number of the errors in each block. The interval is between percentiles of the
     means of randomly drawn blocks (Efron and Tibshirani, 'An introduction to the bootstrap', 1993, chapters 8 and 13).

@@ -153,7 +153,8 @@ class ManyMakers:
 def score_methods(
     config: RigConfig, place: Place, estimators: Sequence[str], filters: Sequence[str], seed: int
 ) -> list[TradeoffRow]:
-    """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames."""
+    """Scan once with a simulated rig and score the map that each estimator and filter makes from the same frames.
+    Raises UsageError if the scan cannot be done or the line is nowhere seen."""
     with open_rig(config, seed=seed) as rig:
         assert rig.world is not None, "only simulated rigs are tried"
         plan, timing = prepare(rig)

@@ -62,7 +62,7 @@ class Tradeoff:
     answer: the setting to use; None without a wish, or if each setting has too many missing answers.
     verdict: 'aborted' if an interrupt ended it; the rows are then those that were complete.
     folder: where everything was written; None if nothing was.
-    accepted_calibration: reasons to refuse the calibration, which was used all the same.
+    accepted_calibration: reasons against the calibration that was used in spite of them.
     """
 
     rows: tuple[TradeoffRow, ...]
@@ -94,7 +94,8 @@ class Tradeoff:
 
 
 def cases_of(trials: Trials, asked: TradeoffRequest) -> list[Case]:
-    """A case for each repeat of each trial, with at least one estimator and filter: trial by trial, seed by seed."""
+    """A case for each repeat of each trial, trial by trial and seed by seed. It is for all estimators and filters
+    together."""
     cases = []
     for trial, config in trials.items():
         scene = str(getattr(config.world, "scene", "")) if trial.scene is None else trial.scene
@@ -117,7 +118,8 @@ OF_ALL_ROWS: Final = (
 def scan_once(
     config: Mapping[str, Any], place: Place, methods: tuple[Sequence[str], Sequence[str]], seed: int
 ) -> dict[str, Any]:
-    """One scan as a case: rows of all estimators and filters as plain values, with the times that they took apart."""
+    """One scan, for a case of `cases_of`: rows of all estimators and filters as plain values, and apart from them their
+    computing times. methods: estimators, filters."""
     rows = score_methods(RigConfig.model_validate(config), (place[0], place[1]), *methods, seed)
     return {
         "rows": [{key: value for key, value in asdict(row).items() if key not in OF_ALL_ROWS} for row in rows],
@@ -132,7 +134,8 @@ def tabulate(
     found: Sequence[Result | None],
     verdict: Literal["complete", "aborted"] = "complete",
 ) -> Tradeoff:
-    """Make the trade-off of the results of `cases_of`, as far as they go: trials with a result missing are left out."""
+    """Make the trade-off from the results of the cases of `cases_of`. Trials with a missing result (None) are left out.
+    Limits are added if they are asked for and the verdict is 'complete'."""
     rows: list[TradeoffRow] = []
     limits = SceneLimits(asked.exposures)
     for number, config in enumerate(trials.values()):

@@ -1,7 +1,7 @@
 """Measures the same scenes with every strategy (a way to measure depth), and tabulates the results.
 
-Every measurement has the same camera, the same power of its source, the same ambient light and the same time. All are
-repeated with each seed, which decides counts and noise; surfaces, drops and hot pixels stay as they are. A row of the
+Every measurement has the same camera, the same power of its source, the same ambient light and the same time. Each is
+repeated with every seed. A seed decides counts and noise; surfaces, drops and hot pixels stay as they are. A row of the
 table is one strategy in one scene and air, with one rule and time.
 """
 
@@ -52,8 +52,9 @@ class ComparisonPlan:
     """Scenes, air, times and rules of a comparison.
 
     scenes: bundled names, files or folders, by the names that they have in the table. airs: fog, rain, snow or clear
-    air; None for a scene's own. times_s: time of a measurement. rows: number of image rows, from the middle of the
-    picture. lux: ambient light; None for each scene's own.
+    air; None for a scene's own. times_s: time of a measurement. rules: how the columns that are lit share the light
+    (`rig.strategies.apparatus.Rule`). rows: number of image rows, from the middle of the picture. lux: ambient light;
+    None for each scene's own. seeds: one measurement with each.
     """
 
     scenes: Mapping[str, str]
@@ -69,12 +70,13 @@ class ComparisonPlan:
 class StrategyRow:
     """One strategy in one scene and air, by one rule, within one time; means over all seeds.
 
-    air: a visibility, clear, rain or snow; None for the scene's own. mean_px, median_px, good, valid, confident_wrong:
-    as in `Score`; None if the strategy needs more time. `too_short` then says how much. spread_px: standard deviation
-    of mean_px over the seeds, None for one seed. median_mm: median depth error. range_m: farthest distance at which
-    90 % of the pixels are within 2 % of the depth, None if there is none. spent_ms: sensor time. energy_mj: energy of
-    the light. compute_s: computing time, simulation included. laser_class, laser_class_still: of the source while it
-    works, and if it stood still; None without a source, or if its light is not visible.
+    air: a visibility such as 20m, or clear, rain or snow; None for the scene's own. rule: as in `ComparisonPlan`.
+    mean_px, median_px, good, valid, confident_wrong: as in `Score`; None if the strategy needs more time. `too_short`
+    then says how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median
+    depth error. range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is
+    none. spent_ms: sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included.
+    laser_class: class of the source while it works; laser_class_still: its class if it stood still. Both are None
+    without a source, or if its light is not visible.
     """
 
     strategy: str
@@ -104,8 +106,8 @@ class StrategyRow:
 class Comparison:
     """Result of a comparison.
 
-    rows: those that are complete. verdict: 'aborted' if an interrupt ended it. sentences: what each strategy does, by
-    its name. notes: lines that must be shown with the result. folder: where it was written.
+    rows: the complete rows. verdict: 'aborted' if an interrupt ended it. sentences: what each strategy does, by its
+    name. notes: lines that must be shown with the result. folder: where it was written.
     """
 
     rows: tuple[StrategyRow, ...]
@@ -140,7 +142,7 @@ def run_comparison(
     asked: ComparisonPlan,
     progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Measure with all strategies in this process and tabulate.
+    """Measure everything that is `asked` with all strategies, in this process, and tabulate.
 
     progress: called with the number of measurements done and the total.
 
@@ -178,7 +180,8 @@ def cases_of(config: RigConfig, ways: Sequence[Strategy], asked: ComparisonPlan)
 def measure_once(
     config: Mapping[str, Any], place: Mapping[str, Any], way: str, rule: Rule, time_s: float, seeds: tuple[int, int]
 ) -> dict[str, Any]:
-    """One row of a comparison as a case: plain values, with the computing time apart."""
+    """One row of a comparison, for a case of `cases_of`: plain values, with the computing time apart. place: fields of
+    `Place`. way: name of the strategy. seeds: the first, and the last plus one."""
     row = _measured(open_scene(config, Place(**place)), find_strategy(way), rule, time_s, range(*seeds))
     content = asdict(row)
     compute_s = content.pop("compute_s")
@@ -188,7 +191,8 @@ def measure_once(
 def tabulate(
     ways: Sequence[Strategy], found: Sequence[Result | None], verdict: Literal["complete", "aborted"] = "complete"
 ) -> Comparison:
-    """Make the comparison of the results of `cases_of`; those that are missing are left out."""
+    """Make the comparison from the results of the cases of `cases_of`, in their order; missing ones (None) are left
+    out."""
     rows = tuple(
         StrategyRow(**{**row, "compute_s": compute_s})
         for result in found
@@ -290,7 +294,8 @@ class Reached:
         self._all += np.bincount(self._bin, minlength=len(self._all))
 
     def range_m(self) -> float | None:
-        """Largest depth in the farthest bin of which at least the share REACHED is good; None if there is none."""
+        """Largest depth in the farthest bin of which at least the share REACHED is good; None if there is none. Bins
+        with fewer than FEWEST pixels are left out."""
         counts = np.bincount(self._bin, minlength=len(self._all)) >= FEWEST
         far = np.flatnonzero(counts & (self._good >= REACHED * np.maximum(self._all, 1)))
         return float(self._true_m[self._bin == far[-1]].max()) if len(far) else None

@@ -88,7 +88,8 @@ def _class_1_j(duration_s: float, wavelength_m: float) -> float:
 
 
 def class_of(beam: Beam, wavelength_m: float) -> LaserClass:
-    """The lowest class whose limits a beam meets. Raises ValueError for light that is not visible."""
+    """The lowest class whose limits a beam meets. Raises ValueError for light that is not visible, unless the beam has
+    no power."""
     return next((each for each in CLASSES if _meets(beam, each, wavelength_m)), "4")
 
 
@@ -143,11 +144,12 @@ class Field:
         return Beam(power_w, map_s * self.across, 1 / map_s), Beam(power_w)
 
     def pattern(self) -> tuple[Beam, Beam]:
-        """Beam of a projector's picture with half of its columns lit, for a pupil that lies in lit columns only."""
+        """Beam of a projector's picture with half of its columns lit, for a pupil that lies in lit columns only. It is
+        returned twice, since it does not scan."""
         beam = Beam(min(2 * self.of_picture, 1.0) * self.power_w)
         return beam, beam
 
     def flash(self, pulse_s: float, rate_hz: float) -> tuple[Beam, Beam]:
-        """Beam of short pulses that light the whole field."""
+        """Beam of short pulses that light the whole field. It is returned twice, since it does not scan."""
         beam = Beam(self.of_picture * self.power_w / (pulse_s * rate_hz), pulse_s, rate_hz)
         return beam, beam

@@ -1,8 +1,8 @@
 """Writes the files of a comparison: strategies.json, strategies.csv and two pictures.
 
-`strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility. Both
-show the best strategy of each kind. Strategies are of one kind if the first word of their names and their sensor (SPAD
-or conventional camera) are the same.
+`strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility (only
+written if an air has a visibility). Both show the best strategy of each kind. Strategies are of one kind if the first
+word of their names and their sensor (SPAD or conventional camera) are the same.
 """
 
 import math
@@ -77,7 +77,8 @@ def time_svg(rows: Sequence[StrategyRow]) -> str:
 
 
 def visibility_svg(rows: Sequence[StrategyRow]) -> str:
-    """Error and range over visibility, for the time nearest to SHOWN_MS, with equal energy if it was measured."""
+    """Error and range over visibility, for the time nearest to SHOWN_MS and the rule of the first row. Raises
+    ValueError if no row has a visibility."""
     rule = rows[0].rule
     some = [row for row in rows if row.rule == rule and visibility_m(row.air) is not None]
     time_ms = min((row.time_ms for row in some), key=lambda each: abs(math.log(each / SHOWN_MS)))

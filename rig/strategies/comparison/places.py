@@ -2,8 +2,8 @@
 
 A scene is a bundled name, a scene file, a folder of surfaces, or `ramp`: a wall with random texture that recedes from
 1.2 to 14 m, so that every distance is there. The air that is asked for replaces fog, rain and snow of the scene. Fog of
-a visibility is always one of droplets that scatter light more than once, whatever fog the scene has. Ambient
-light is that of the scene; a scene without any gets that of the bundled scenes.
+a visibility is always one of droplets that scatter light more than once, whatever fog the scene has. Ambient light is
+that of the scene; a scene without any gets that of the bundled scenes.
 """
 
 import os
@@ -64,9 +64,11 @@ def visibility_m(air: str | None) -> float | None:
 
 
 def scene_file(scene: str, air: str | None, lux: float | None, model: RigModel, folder: Path) -> Path:
-    """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if it cannot be read.
+    """Write a scene in an air to a file in `folder`, and return its path. Raises UsageError if the scene cannot be read
+    or names surfaces that are not there.
 
-    air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: of the camera, for `ramp`.
+    air: None for the scene's own. lux: ambient illuminance, None for the scene's own. model: the rig whose camera
+    `ramp` is made for.
     """
     content = _content(scene, model, folder)
     if air is not None:

@@ -1,4 +1,4 @@
-"""An opened scene in one air, before which strategies measure. It is kept until another one is wanted."""
+"""A scene in one air, opened for strategies to measure it. It is kept open until another one is wanted."""
 
 import weakref
 from collections.abc import Mapping
@@ -32,8 +32,8 @@ LINES: Final = 8
 class Place:
     """A scene in an air, and what is seen of it.
 
-    name: of the scene in the table. scene: a bundled name, a file or a folder. air: None for the scene's own. rows:
-    number of image rows, from the middle of the picture. lux: ambient light; None for the scene's own.
+    name: name of the scene in the table. scene: a bundled name, `ramp`, a file or a folder. air: None for the scene's
+    own. rows: number of image rows, from the middle of the picture. lux: ambient light; None for the scene's own.
     """
 
     name: str
@@ -75,7 +75,7 @@ class OpenScene:
             weakref.finalize(self, stack.pop_all().close)
 
     def apparatus(self, rule: Rule, seed: int) -> Apparatus:
-        """A new apparatus before this scene. Raises UsageError if there can be none."""
+        """Make a new apparatus before this scene. Raises UsageError if there can be none."""
         scan = self.config.scan
         try:
             made: Apparatus = self._world.apparatus(

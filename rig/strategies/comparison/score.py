@@ -42,7 +42,7 @@ class Score:
 
 
 def scored_pixels(truth: SweepTruth, geometry: ColumnGeometry) -> Bools:
-    """Mask (rows, width) of the pixels that are scored, of the measured rows. truth: that of all rows, for the
+    """Mask (rows, width) of the pixels that are scored, of the measured rows. truth: truth of all image rows, for the
     geometry's columns."""
     depth_m, stripes = truth.depth_m[geometry.rows], truth.x_px[geometry.rows]
     near_m, far_m = geometry.depth_range_m

@@ -46,7 +46,7 @@ def plain_code(bits: int, columns: int) -> Uint8:
 
 def gray_code(bits: int, columns: int) -> Uint8:
     """Bits (bits, columns) of the reflected Gray code of the column's number, most significant first; neighbours differ
-    in one bit, also where the code repeats after 2^bits columns."""
+    in one bit, even where the code repeats after 2^bits columns."""
     number = np.arange(columns) % 2**bits
     return _bits_of(number ^ (number >> 1), bits)
 
@@ -69,7 +69,7 @@ def _bits_of(number: Int64, bits: int) -> Uint8:
 
 
 def bits_for(numbers: float) -> int:
-    """Number of bits of a code with at least so many numbers."""
+    """Number of bits of a code with at least `numbers` different words."""
     return max(int(np.ceil(np.log2(max(numbers, 2)))), 1)
 
 
@@ -151,7 +151,8 @@ class BinaryCode:
     clear_px: float = 0.5
 
     def patterns(self, geometry: ColumnGeometry) -> tuple[Float32, list[float]]:
-        """Patterns (patterns, columns) in the order in which they are shown, and their shares of the time."""
+        """Patterns (patterns, columns) in the order in which they are shown, and relative shares of the time, at least
+        1 each."""
         code = (gray_code if self.gray else plain_code)(bits_for(window_columns(geometry)), geometry.columns)
         if self.inverse:
             pairs = np.stack([code, 1 - code], axis=1).reshape(-1, code.shape[1])

@@ -2,8 +2,8 @@
 
 Single-Photon Structured Light (V. Sundar, S. Ma, A. C. Sankaranarayanan, M. Gupta, CVPR 2022) shows many short binary
 patterns, and protects the column's code against missed photons and ambient light. Pattern design of this kind is the
-subject of the patent application US 2023/0410333; this is written from the idea alone, to compare ways to measure depth
-in simulation, and drives no projector.
+subject of the patent application US 2023/0410333; this module is written from the idea alone, to compare ways to
+measure depth in simulation, and drives no projector.
 
 Each column has a code word:
 
@@ -17,8 +17,8 @@ All words light a pixel about half of the time. So a bit is read as 1 if the pix
 all patterns, and no word has an advantage because it is darker.
 
 A decoder takes the word that differs in the fewest bits, or the likeliest word. The likelihood uses the counts only.
-Suppose that, by a word, n1 frames were lit and n0 were dark, and that the pixel fired in k1 and k0 of them. If all
-probabilities p1 > p0 of firing in a lit and in a dark frame are equally likely beforehand, the word's likelihood is
+Suppose that n1 frames were lit and n0 were dark if a word is right, and that the pixel fired in k1 and k0 of them. If
+all probabilities p1 > p0 of firing in a lit and in a dark frame are equally likely beforehand, the word's likelihood is
 
     L = integral p1^k1 (1 - p1)^(n1 - k1) dp1  integral p0^k0 (1 - p0)^(n0 - k0) dp0
       = k1! (n1 - k1)! / (n1 + 1)!  k0! (n0 - k0)! / (n0 + 1)!
@@ -66,8 +66,8 @@ Words = Literal["repetition", "bch", "hybrid"]
 def generator(length: int, message_bits: int) -> int:
     """Generator polynomial over GF(2), bit i for x^i, of the narrow-sense binary BCH code with words of 2^m - 1 bits.
 
-    It has the roots alpha, alpha^2, ... until length - message_bits of them are used up. Raises ValueError if the code
-    does not exist.
+    Its roots, length - message_bits in number, are alpha, alpha^2, ..., each with all its conjugates. Raises ValueError
+    if the code does not exist.
     """
     m = length.bit_length()
     if length != 2**m - 1 or m not in PRIMITIVE:
@@ -156,8 +156,8 @@ class CodeBook:
 def code_book(kind: Words, numbers: int, frames: int) -> CodeBook:
     """Code book with at least `numbers` words and at most `frames` patterns.
 
-    All patterns of a code get the same number of frames. Of the codes that fit, the one is taken whose words differ in
-    the largest number of frames. Raises `TooShort` if even the shortest has more patterns than there are frames.
+    All patterns of a code get the same number of frames. Of the codes that fit, the one is taken in which any two words
+    differ in the most frames. Raises `TooShort` if even the shortest has more patterns than there are frames.
     """
     if kind == "repetition":
         bits = bits_for(numbers)
@@ -322,7 +322,7 @@ class ErrorCode:
     clear_px: float = 1.0
 
     def measure(self, apparatus: Apparatus, geometry: ColumnGeometry, budget: Budget, rng_seed: int) -> Answer:
-        """Measure once. Nothing is random here."""
+        """Measure once. Nothing is random here. Logs `NOTICE`."""
         _log.info("%s: %s", self.name, NOTICE)
         frames = int(spad_frames(apparatus, budget, [1.0])[0])
         book = code_book(self.words, window_columns(geometry), frames)

@@ -6,8 +6,8 @@ if no frame or every frame fired). Grey levels of a conventional camera have the
 noise and gain are not known to a strategy. So alpha and beta are fitted to the differences between the levels and those
 expected of the decoded pattern.
 
-Every pattern lights about half of the columns, and so does a reference picture. So a lit column is equally bright in
-all of them, whatever the rule by which the columns share the power.
+Every pattern lights about half of the columns. So a lit column is equally bright in all of them, whatever the rule by
+which the columns share the power.
 """
 
 from collections.abc import Sequence
@@ -66,7 +66,8 @@ def spad_frames(apparatus: Apparatus, budget: Budget, weights: Sequence[float]) 
 
 
 def flux_of(counts: NDArray[np.uint32], frames: NDArray[np.int64]) -> tuple[Float64, Float64]:
-    """Photons per frame and their variance, float64 like counts. counts: (patterns, rows, width), at most frames."""
+    """Photons per frame and their variance, float64 like counts. counts: (patterns, rows, width), at most frames
+    (patterns,), else ValueError is raised."""
     k = frames[:, None, None].astype(np.float64)
     n = counts.astype(np.float64)
     if np.any(n > k):
@@ -81,7 +82,8 @@ def measured(
     """Show patterns (patterns, columns) and return what pixels saw. weights: shares of the SPAD's time, by pattern.
 
     A conventional camera exposes all patterns equally. If an exposure would saturate, it takes several shorter ones of
-    each pattern. A camera's variance is only that of rounding until `with_noise` has fitted it.
+    each pattern, and their levels are averaged. Raises `TooShort` if the budget is too short for all patterns. A
+    camera's variance is only that of rounding until `with_noise` has fitted it.
     """
     if camera == "spad":
         frames = spad_frames(apparatus, budget, weights)
@@ -118,7 +120,8 @@ def _exposure(apparatus: Apparatus, patterns: Float32, budget: Budget) -> tuple[
 
 
 def with_noise(levels: Levels, camera: Camera, expected: Float64, free: int) -> tuple[Levels, Float64]:
-    """Levels with the fitted noise of a camera, and how many times larger the variance is than noise explains.
+    """Levels with the fitted noise of a camera (those of a SPAD as they are), and how many times larger the variance is
+    than noise explains.
 
     expected: light (patterns, rows, width) that the decoded pattern would give. free: number of parameters that were
     fitted for it in each pixel, less than the number of patterns. The second result is float64 (rows, width), at least

@@ -15,8 +15,8 @@ then P / (2 pi) sqrt(2 / N) for a period of P columns. There are three ways to k
   one with three shifts and the others once. Haze is wide, so it has no contrast at short periods, and is the same for
   all of them.
 
-OpenCV's `SinusoidalPattern` has only three shifts of 8-bit images, and counts periods along paths over the picture,
-which end at depth edges. Tests compare with it for three shifts.
+OpenCV's `SinusoidalPattern` has only three shifts of 8-bit images, and counts periods along paths over the picture.
+Such a path ends at a depth edge. Tests compare with it for three shifts.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ def whole_period(least: float, columns: int) -> float:
 
 
 def shifted_sines(period: float, shifts: int, columns: int) -> Float32:
-    """Patterns (shifts, columns) from 0 to 1, cos(2 pi (column / period - k / shifts))."""
+    """Patterns (shifts, columns) from 0 to 1, (1 + cos(2 pi (column / period - k / shifts))) / 2 for shift k."""
     phase = np.arange(columns) / period - np.arange(shifts)[:, None] / shifts
     return (0.5 + 0.5 * np.cos(2 * np.pi * phase)).astype(np.float32)
 
@@ -181,7 +181,7 @@ def _mean_of(levels: Levels, times: int) -> Levels:
 def micro_periods(columns: int, window: int) -> Float64:
     """Periods (MICRO_PERIODS,) of micro phase shifting in columns. A whole number of each fits the field.
 
-    Of `MICRO_TRIALS` random sets it is the one whose codes of columns up to `window` apart are the least alike.
+    Of `MICRO_TRIALS` random sets it is the one in which codes of columns 2 to `window` apart are the least alike.
     """
     return np.array(_micro_periods(columns, window))
 

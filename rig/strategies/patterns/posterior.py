@@ -26,7 +26,7 @@ class Window:
     """
 
     def __init__(self, geometry: ColumnGeometry, row: int, infinite: Float64) -> None:
-        """row: index of a measured row. infinite: `columns_at_infinity` of all rows."""
+        """Find the candidates of one row. row: index of a measured row. infinite: `columns_at_infinity` of all rows."""
         first, last = geometry.first[row].astype(np.int64), geometry.last[row].astype(np.int64)
         self.low = first - MARGIN
         steps = np.arange(int(np.max(geometry.last - geometry.first, initial=0)) + 2 * MARGIN + 1)
@@ -55,7 +55,8 @@ class Window:
     def around(self, score: Float64, place: NDArray[np.int64]) -> tuple[Float64, Float64, Float64]:
         """Scores of the candidates before, at and after an index, (width,) each.
 
-        The first and the last are at most that at the index, and equal to it where there is no such candidate.
+        Scores before and after that exceed the one at the index are lowered to it. Where there is no candidate before
+        or after, its score is that at the index.
         """
         pixel, most = np.arange(len(place)), score.shape[1] - 1
         at = score[pixel, place]
