@@ -43,7 +43,7 @@ def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def bit_of(x: int) -> np.uint64:
-    """The bit of pixel x in its word, x // 64 of the row (`packbits` order in a little-endian word)."""
+    """The bit of pixel x within its word, which is word x // 64 of the row (`packbits` order, little-endian words)."""
     return np.uint64(1) << np.uint64((x % WORD_PX) ^ 7)
 
 
@@ -102,14 +102,14 @@ def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log
 
 
 def defects(sensor: Sensor, size: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The dead and the hot pixels, two masks of shape `size` (rows, width). The same sensor always gets the same."""
+    """The dead and the hot pixels, masks of shape `size` (rows, width) that depend on the sensor's settings alone."""
     # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
     lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(size)
     return lot < sensor.dead_share, lot >= 1 - sensor.hot_share
 
 
 class Defects:
-    """Hot and dead pixels, whose electronics read 1 or 0 in every frame, whatever their diode does.
+    """Hot pixels read 1 and dead pixels read 0 in every frame, whatever their diodes do.
 
     Acts on the bits in the pixels' memories, after crosstalk and all other effects between diodes. A real colour SPAD
     has 4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube) without clusters: pairs of

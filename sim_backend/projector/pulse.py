@@ -15,8 +15,8 @@ time. sigma is the extinction without the light that is only scattered forward: 
 way, it gains from the paths beside it, as the flash lights them too.
 
 Light scattered more than once multiplies both by 1 + M. M is that of `beam_spread.totals` at the optical depth of R or
-r (as if all of the picture were that far away). The additional light of the surface has made a detour. Its length has
-an exponential distribution with the mean
+r (as if all of the picture were that far away). The additional light of the surface has made a detour. Half of the
+length that it adds to the way there and back has an exponential distribution with the mean
 
     DETOUR (1 - mean cosine) (1 + DETOUR_GROWTH sigma R) R
 
@@ -69,10 +69,10 @@ LEAST_RANGE_M = 1e-3
 class Echoes:
     """Light of pulses that comes back to the pixels of chosen rows, float64 (rows, width).
 
-    range_m: distance of the surface, infinite if there is none. surface_per_j: detections of the surface per joule of a
-    pulse, by light that was not scattered. late_per_j: the same by light that was scattered. detour_m: half of the mean
-    length by which its way there and back is longer. steady_per_s: detections per second without the source. fog: light
-    of the medium. stretch: smallest and largest ratio of distance to depth.
+    range_m: distance of the surface, infinite if there is none. surface_per_j, late_per_j: detections per joule of a
+    pulse, by light from the surface that was not scattered, and by light from it that was scattered. detour_m: half of
+    the mean length that scattering adds to the way there and back. steady_per_s: detections per second without the
+    source. fog: light of the medium. stretch: smallest and largest ratio of distance to depth.
     """
 
     range_m: Array
@@ -194,8 +194,8 @@ def gate(source: PulsedSource, depth_range_m: tuple[float, float], stretch: tupl
 def first_photons(
     rng: np.random.Generator, back: Echoes, gate: Gate, pulses: int, pulse_j: float, bits: SensorBits
 ) -> NDArray[np.uint32]:
-    """Number of first photons by time bin, uint32 (rows, width, bins). Dead pixels detect none, hot ones fire when the
-    gate opens. Raises ValueError if the counts would take more than `MOST_BYTES`."""
+    """Number of first photons of all pulses by time bin, uint32 (rows, width, bins). Dead pixels detect none, hot ones
+    fire when the gate opens. Raises ValueError if the counts would take more than `MOST_BYTES`."""
     rows, width = back.range_m.shape
     if 4 * rows * width * gate.bins > MOST_BYTES:
         raise ValueError(

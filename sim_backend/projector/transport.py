@@ -67,8 +67,9 @@ FEW = 8
 class Moment:
     """Light of drops and flakes at one moment, as a sparse matrix.
 
-    first, number: of each column and row, the first entry and the number of entries. x, value: of each entry, the pixel
-    (int32) and the detections per second and watt (float32)."""
+    first, number: (columns, rows), index of the first entry of a column and row, and number of its entries. x, value:
+    (entries,), pixel (int32) and detections per second and watt (float32).
+    """
 
     first: NDArray[np.int64]
     number: NDArray[np.int64]

@@ -137,7 +137,7 @@ class IbeamModel:
         self._tell()
 
     def set_fault(self, text: str, now_s: float) -> None:
-        """Let a fatal fault switch the laser off, for as long as `fault` holds its text."""
+        """Let a fatal fault switch the laser off. It cannot be switched on as long as `fault` holds a text."""
         self._now_s, self.fault, self.state_on = now_s, text, False
         self._tell()
 

@@ -62,11 +62,11 @@ _SETTINGS = ("SOUR:POW:LEV:IMM:AMPL", "SOUR:AM:INT", "SOUR:AM:EXT", "SOUR:AM:STA
 class ObisModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change. channel: the laser's slot, if it is on a
-    Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits 0x1080
-    set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched on, as
-    the manual's table has it. emission_bit_lag_s: time for which the status still says 'emission' after the laser was
-    switched off.
+    on_emission(emits, now_s) is called when `emitting` or `power_w` has changed. channel: the laser's slot, if it is on
+    a Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits
+    0x1080 set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched
+    on, as the manual's table has it. emission_bit_lag_s: time for which the status still says 'emission' after the
+    laser was switched off.
     """
 
     handshake: bool = True

@@ -88,7 +88,7 @@ class Program:
 
     @property
     def duration_s(self) -> float:
-        """Duration of all runs."""
+        """Duration of all runs; infinite if they have no end."""
         return self.n_runs * self.length_ns * _NS if self.n_runs > 0 else math.inf
 
 

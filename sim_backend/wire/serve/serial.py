@@ -61,7 +61,7 @@ class SerialServer(WireServer[SerialModel]):
         self._folder.cleanup()
 
     def plug(self) -> None:
-        """Plug the cable in."""
+        """Plug the cable in. Raises DeviceError on Windows, which has no pseudo terminals."""
         with self.lock:
             if self._master is not None:
                 return

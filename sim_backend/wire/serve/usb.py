@@ -60,7 +60,11 @@ class _Handle:
 
 
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
-    """A bus. `plug` may be called at any time from any thread. Waiting uses the clock that is passed in."""
+    """A bus. `plug` may be called at any time from any thread. Waiting uses the clock that is passed in.
+
+    A transfer returns the number of bytes that passed before its timeout in ms, and raises USBTimeoutError if none did.
+    A timeout of 0 raises ValueError.
+    """
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()

@@ -162,7 +162,7 @@ class UsbModel:
     """Whether the device cut its own connection: the transport unplugs it at the next call."""
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Note that the host chose an alternate setting. It is 0 also when the host released the interface or died."""
+        """Note that the host chose an alternate setting. It returns to 0 if the host releases the interface or dies."""
 
     def halt_cleared(self, endpoint: int, now_s: float) -> None:
         """Note that the host cleared a halt, which it may do without any halt before (USB 2.0, 9.4.5)."""
@@ -247,7 +247,7 @@ class AttachedDevice:
             self.model.configured(self._now())
 
     def reset(self) -> None:
-        """Reset the port: the host then chooses the configuration again. libusb claims its interfaces again."""
+        """Reset the port: the host then chooses the configuration again. Claims stay, since libusb renews them."""
         with self._alive():
             self.configuration = 1
             self._alternates.clear()

@@ -60,7 +60,7 @@ class Card:
         self._follow(terminal, now_s)
 
     def reset(self, now_s: float) -> None:
-        """Reset the device: abort all tasks. Analogue outputs go to 0 V, lines to their level after power-up."""
+        """Reset the device: abort all tasks. Analogue outputs go to 0 V, all others low."""
         for task in self.tasks.values():
             task.error = DaqmxError(-88709) if task.state == ni.RUNNING else task.error
             self.stop(task, now_s, ni.VERIFIED)
@@ -78,7 +78,8 @@ class Card:
         return found[0]
 
     def source(self, task: DaqTask) -> str:
-        """Terminal of the clock that a task counts; "" is the card's own clock."""
+        """Terminal of the clock that a task counts; "" is the card's own clock. Raises DaqmxError for one that it
+        cannot count."""
         if task.source.lower() in ("", "onboardclock"):
             return ""
         known = self.terminal(task.source)
@@ -87,7 +88,7 @@ class Card:
         return known
 
     def physical(self, text: str, kind: str) -> list[str]:
-        """The outputs in a list of physical channels of a kind: ao, port or ctr."""
+        """The outputs in a list of physical channels of a kind: ao, port or ctr. Raises DaqmxError for others."""
         found: list[str] = []
         for one in expand(text):
             device, _, local = one.removeprefix("/").lower().partition("/")
@@ -102,7 +103,7 @@ class Card:
         return found
 
     def check_device(self, name: str) -> None:
-        """Refuse a device that does not exist."""
+        """Raise DaqmxError for a device that does not exist."""
         if name.lower() != self.name.lower():
             raise DaqmxError(-200220, f"Device: {name}")
 
@@ -143,7 +144,8 @@ class Card:
         task.state = max(task.state, ni.VERIFIED)
 
     def commit(self, task: DaqTask) -> None:
-        """Bring a task to the state committed, with all its resources."""
+        """Bring a task to the state committed, with all its resources. Raises DaqmxError if the task is wrong, or if
+        another task has one of the resources."""
         self.verify(task)
         if task.state >= ni.COMMITTED:
             return
@@ -161,7 +163,8 @@ class Card:
         task.state = ni.COMMITTED
 
     def start(self, task: DaqTask, now_s: float, before: int) -> None:
-        """Start a task, unless it runs. before: the state to which a stop brings it back."""
+        """Start a task, unless it runs; it may then wait for its trigger. before: the state to which a stop brings it
+        back. Raises DaqmxError if it cannot start."""
         if task.state == ni.RUNNING:
             return
         self.commit(task)
@@ -233,7 +236,8 @@ class Card:
                 self._pause(other, at_s)
 
     def lay(self, task: DaqTask, sample: int) -> None:
-        """Give the outputs of a task with a clock its samples from a number on, in place of what was to come there."""
+        """Give the outputs of a task with a clock its samples from number `sample` on, in place of what was to come
+        then."""
         assert task.edges is not None, "asked for by the caller"
         if task.kind == "co":
             delay, high, low = task.pulse
