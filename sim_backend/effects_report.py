@@ -31,14 +31,14 @@ SPARSITY = 6
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """The report for columns of `exposures` frames of `exposure_s` each, at a power of the laser of `power_w`. Its
-    keys:
+    """The report for columns of `exposures` frames of `exposure_s` each, at the laser power `power_w`. Its keys:
 
-    planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and exposures that the plan
-    holds for. changed_decisions_bound: bound on the share of decisions that change because effects are left out, all
-    together. effects: one mapping for each effect of the catalogue, with effect, on, why, share (of the detected
-    photons, before saturation, over 16 mirror positions), changed_decisions_bound (None: unknown), removable (whether
-    the world can do without it), cost_us_per_frame (None: it is part of a device, of another effect or of the gain).
+    planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and exposures that the
+    plan holds for.
+    changed_decisions_bound: bound on the share of decisions that all left-out effects can change together.
+    effects: one mapping for each effect of the catalogue, with effect, on, why, share (of the detected photons, before
+    saturation, over 16 mirror positions), changed_decisions_bound (None: unknown), removable (whether the world can do
+    without it), cost_us_per_frame (None: it is part of a device, of another effect or of the gain).
     """
     plan, model = world.effect_plan, world.flux_model
     photons, laser_us = _light(world, model, power_w * world.fan.total * exposure_s, exposure_s, exposures)

@@ -34,9 +34,8 @@ def log_miss(probability: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
-    """The next hit after `place` (-1: the first hit), infinity if p is 0. draw: number of this random draw, 0, 1, 2,
-    ..., in the key's stream. log_miss: ln(1 - p).
-    """
+    """The next hit after `place`, infinity if p is 0. A place of -1 gives the first hit. draw: number of this random
+    draw, 0, 1, 2, ..., in the key's stream. log_miss: ln(1 - p)."""
     uniform = (float(frame_key(key, np.uint64(draw)) >> np.uint64(11)) + 0.5) * 2.0**-53
     return place + 1.0 + math.floor(math.log(uniform) / log_miss) if log_miss < 0.0 else math.inf
 

@@ -6,10 +6,10 @@ with the flux lambda and the probability p that the pixel's bit is 1. `share` is
 the gate let light out. `steady` are detections per second without the laser, computed once; `sheet` are the laser's
 detections per second and watt, computed once per command.
 
-Tracing the light costs more than drawing a frame. So the frames that the mirror spends in one cell of a grid
-(`CommandGrid`) all get their mean position; the mean position over a column's frames is then that of the moving mirror.
-If the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per pixel
-of width.
+Tracing the light costs more than drawing a frame. So all frames that are exposed while the mirror is in one cell of a
+grid (`CommandGrid`) get their mean position; the mean position over a column's frames is then that of the moving
+mirror. If the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per
+pixel of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence

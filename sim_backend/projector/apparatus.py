@@ -53,6 +53,8 @@ class Request:
 
     power_w: power of the source. rule: how light is shared. seed: of all random draws. depth_range_m: nearest and
     farthest depth, which decides the gate of the pulsed source. frame_s: time of a frame of the SPAD.
+
+    Raises ValueError for impossible values.
     """
 
     power_w: float

@@ -167,7 +167,7 @@ def _back_per_m_sr(what: Rain | Snow) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Time bins after a pulse. sigma_s: blur of arrival times, one standard deviation."""
+    """Time bins after the middle of a pulse has left. sigma_s: blur of arrival times, one standard deviation."""
 
     start_s: float
     bin_s: float
@@ -230,8 +230,8 @@ def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, 
     """Write into mean (bins,) the average detections of a pulse in each bin, as if no photon made the pixel blind.
 
     times: in s, start of the first bin, length of a bin, and blur. echo: (5,), detections of the surface by light not
-    scattered and by light scattered, distance of the surface, mean detour, and steady detections per second. fog:
-    detections of the medium, (bins, parts).
+    scattered and by light scattered, then range_m, detour_m and steady_per_s as in `Echoes`. fog: detections of the
+    medium, (bins, parts).
     """
     start_s, bin_s, sigma_s = times
     surface, late, range_m, detour_m, steady_per_s = echo

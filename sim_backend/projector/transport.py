@@ -318,6 +318,7 @@ def checked_columns(columns: int, command_range: tuple[float, float], limits: tu
 
 
 def blocks(rows: int, patterns: int, width: int, most_bytes: int = 1 << 22) -> Iterator[slice]:
-    """Slices of rows. The light of a slice in all patterns takes about `most_bytes` of memory."""
+    """Slices of rows. The light of a slice in all patterns takes at most `most_bytes` of memory, unless one row takes
+    more."""
     step = max(1, most_bytes // max(1, 4 * patterns * width))
     return (slice(first, min(first + step, rows)) for first in range(0, rows, step))

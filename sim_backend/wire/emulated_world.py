@@ -70,7 +70,8 @@ LOOK_S = 10e-6
 
 
 class EmulatedWorldConfig(WorldConfig):
-    """Config of the world with emulated devices, whose ports are `emulated:laser`, `gate`, `scanner` and `spad`."""
+    """Config of the world with emulated devices. Their ports are `emulated:laser`, `emulated:gate`, `emulated:scanner`
+    and `emulated:spad`."""
 
     real_time: ClassVar[bool] = True
 

@@ -173,7 +173,7 @@ class CoboltModel:
         return self.power_w > 0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.on = True
         self.mode = "modulation" if gated else "constant power"
         self.digital = gated

@@ -121,7 +121,7 @@ class IbeamModel:
         return self._level_w(NORMAL) if self.gated else self.power_w
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.state_on, self._lit_at_s = True, float("-inf")
         self.enabled, self.ext = {BIAS, NORMAL}, gated
         self.powers_w = {BIAS: 0.0, NORMAL: power_w}

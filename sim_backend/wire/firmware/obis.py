@@ -130,7 +130,7 @@ class ObisModel:
         return self.set_power_w if self.emitting else 0.0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.state_on = True
         self._warm_at_s = self._lit_at_s = float("-inf")
         self.mode = "DIGITAL" if gated else "CWP"

@@ -32,7 +32,7 @@ class Card:
         self._outside: dict[str, Edges] = {}
 
     def advance(self, now_s: float) -> None:
-        """Let everything end that ends by itself until now, in order."""
+        """End everything that ends by itself until now, in order of time, and forget what is older than `KEEP_S`."""
         while True:
             task = min(self.tasks.values(), key=DaqTask.ends_s, default=None)
             if task is None or (ends_s := task.ends_s()) > now_s:
@@ -70,7 +70,7 @@ class Card:
     # Names and rates
 
     def terminal(self, text: str, code: int = -89120) -> str:
-        """A terminal's name without the card's. Raises DaqmxError with this code if there is no such terminal."""
+        """Name of a terminal without that of the card. Raises DaqmxError with `code` if there is no such terminal."""
         local = text.removeprefix("/").removeprefix(f"{self.name}/").lower()
         found = [known for known in (*_PINS, *_CLOCKS, *_TRIGGERS) if known.lower() == local]
         if not found:
