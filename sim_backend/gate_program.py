@@ -65,7 +65,7 @@ class GateProgram:
         return not self.ended and self._pulses[self._index].duration_s is None
 
     def advance(self, until_s: float, trigger: Trigger) -> None:
-        """Play on up to `until_s`, that instant excluded."""
+        """Play on up to `until_s`, that instant excluded. trigger: tells when the scan marker is high."""
         while not self.ended:
             duration_s = self._pulses[self._index].duration_s
             if duration_s is None:

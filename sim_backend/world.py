@@ -109,7 +109,7 @@ MOST_VIEWS, TIME_STEP_S = 64, 1e-3
 
 
 class SimulatedWorld:
-    """One scene, one rig, and the `Bench` of its devices. Reading is safe from any thread."""
+    """One scene, one rig, and the `Bench` of its devices. Methods that set nothing may be called from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
         """Raises DeviceError if the geometry, the scene, its board's pose or the focus cannot be used."""

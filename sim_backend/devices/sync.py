@@ -22,7 +22,7 @@ class SimulatedSyncConfig(KindConfig):
 
 
 class SimulatedSync(SyncSource):
-    """Tells the bench, the state that simulated devices share, what the gate does."""
+    """The simulated sync source. It tells the bench, the state that all simulated devices share, what the gate does."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__("simulated sync")

@@ -41,7 +41,7 @@ MULTIPLE = "halo"
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """The hardware that only other ways of measuring depth need."""
+    """Settings of the hardware for ways of measuring depth without a scanned line."""
 
     camera: ConventionalCamera
     pulses: PulsedSource

@@ -78,7 +78,7 @@ class Moment:
 
 
 class Transport:
-    """The light of every column in chosen rows. Reading is safe from any thread."""
+    """The light of every column in chosen rows. Any thread may call its methods."""
 
     def __init__(self, model: RigModel, flux: FluxModel, rows: Rows, commands: Array) -> None:
         """rows: image rows, ascending. commands: (columns,) mirror commands of the columns.

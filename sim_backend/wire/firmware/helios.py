@@ -30,7 +30,7 @@ KEEP_S = 20.0
 class Played:
     """Points played from start_s on, one every period_s, cut off at end_s. The first one lasts longer by longer_s.
 
-    command: float64 (n,), normalised drive. levels: uint8 (n, lines), colour outputs.
+    command: float64 (n,), normalised drive, -1 to 1. levels: uint8 (n, lines), colour outputs.
     """
 
     start_s: float

@@ -8,9 +8,10 @@ again, `disable ext` lets channel 2 shine, channel 2 cannot be switched while `e
 too, `%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
 
 The manual is not public. Made up here: numbers and texts of errors and of the lines of `talk gabby`, the text after a
-start, tables beyond the lines that clients look for, that an open interlock or key switches off and refuses `laser on`,
-that a power beyond the largest is refused, that the channels' sum stops at the largest power, and that echo, prompt and
-talk are forgotten without power. FINE is only stored. The service level (`power mode cw`) is not modelled.
+start, tables beyond the lines that clients look for, that an open interlock or a key turned off darkens the laser and
+makes it refuse `laser on`, that a power beyond the largest is refused, that the channels' sum stops at the largest
+power, and that echo, prompt and talk are forgotten without power. FINE is only stored. Not modelled: the service level
+(`power mode cw`).
 """
 
 import re

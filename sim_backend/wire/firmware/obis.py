@@ -3,8 +3,9 @@
 Each fact has its public source in the table of docs/reference/devices/obis.md. Commands end with CR or LF, replies with
 CRLF; words may be written short (`SYST`) or long (`SYSTem`). The model has the traps of the real laser: set commands
 get no answer with the handshake off, ON during warm-up is deferred, emission follows ON by the CDRH delay, mode changes
-are refused while the laser is on (ERR-200), no status word has the bit 'ready', without its key it says that the
-interlock is open, behind a Remote only numbered commands reach it, and without a Remote none of them does.
+are refused while the laser is on (ERR-200), no status word has the bit 'ready' (unless `words` is "ready"), without its
+key it says that the interlock is open, behind a Remote only numbered commands reach it, and without a Remote none of
+them does.
 """
 
 import re

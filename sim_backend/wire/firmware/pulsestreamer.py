@@ -261,7 +261,7 @@ class PulseStreamerModel:
     # What happens to the device
 
     def power_cycle(self, at_s: float) -> None:
-        """Switch the power off and on."""
+        """Switch the power off and on. The sequence is lost, and the outputs are low."""
         self.advance(at_s)
         self._reset()
 

@@ -153,9 +153,8 @@ class Setup:
 
 
 class UsbModel:
-    """Base of device models, which refuses every transfer. Times are seconds of the transport's clock and never
-    decrease.
-    """
+    """Base of device models. By itself it refuses every transfer. Times are seconds of the transport's clock and never
+    decrease."""
 
     spec: DeviceSpec
     gone: bool = False
