@@ -183,8 +183,8 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): each block's number
-    twice."""
+    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16). Each block's number is
+    there twice."""
     shape = words, 2 * WORD_PX // BLOCK_PX
     return np.repeat(np.arange(words * WORD_PX // BLOCK_PX), 2).astype(np.uint64).reshape(shape)
 
@@ -316,7 +316,7 @@ def power_of_half(t, halving):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", error_model="numpy")
 def one_minus_exp_minus(t):  # type: ignore[no-untyped-def]
-    """1 - exp(-t) for t >= 0, with the same relative error however small t is."""
+    """1 - exp(-t) for t >= 0. Its relative error is as small for small t as for large ones."""
     t = min(t, LARGEST)
     rounded = t * LOG2_E + _ROUNDER
     k = rounded - _ROUNDER

@@ -34,7 +34,8 @@ SEARCH_STEPS = 3
 
 
 class MovingSurfaces:
-    """Makes the view at a given time. Keeps the latest views, since threads that draw rows are at different times."""
+    """Makes the view at a given time. Thread-safe. Keeps the latest views, since threads that draw rows are at
+    different times."""
 
     def __init__(self, velocity_m_per_s: Sequence[float]) -> None:
         """velocity_m_per_s: along x (right), y (down), z (away from the camera)."""

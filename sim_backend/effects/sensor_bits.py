@@ -60,7 +60,7 @@ class Crosstalk:
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
     with probability c / 4 (c: `crosstalk`), all independently. Pixels fired in this way trigger no others, an effect of
     order c^2. A pixel that fires by itself with probability p and has m neighbours that fired is 1 with probability
-    1 - (1 - p)(1 - c/4)^m. If all pixels have the same small p, that is on average p (1 + c). Light that leaves the
+    1 - (1 - p)(1 - c/4)^m. If p is small and equal in all pixels, that is on average p (1 + c). Light that leaves the
     array is lost. c is 0.1 to 0.2 % in 512 x 512 arrays of large pitch; the share beyond 4 neighbours is not modelled.
 
     Exact for any c. Each pixel has four possible transfers (up, down, left, right), numbered pixel by pixel; the gaps

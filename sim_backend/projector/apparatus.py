@@ -76,7 +76,7 @@ class Request:
 
 
 class SimulatedApparatus:
-    """One camera, one light source, one scene."""
+    """One camera, one light source, one scene. Call its methods from one thread only: they share a random generator."""
 
     def __init__(self, transport: Transport, flux: FluxModel, hardware: Hardware, request: Request) -> None:
         """flux: the effects that the transport was computed with."""

@@ -214,7 +214,8 @@ class Transport:
         return found
 
     def at_moment(self, light: Float32, watts: Float32, rows: slice, moment: Moment | None) -> Float32:
-        """The light (rows of the slice, patterns, width) of `of_patterns` with that of drops and flakes at a moment."""
+        """The light (rows of the slice, patterns, width) of `of_patterns` with that of drops and flakes at a moment;
+        `light` itself if the moment is None."""
         if moment is None:
             return light
         found = light.copy()

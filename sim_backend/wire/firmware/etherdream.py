@@ -61,8 +61,9 @@ class EtherDreamModel:
         mac: bytes = b"\x00\x04\xa3\x87\x28\xcd",
         build: str = "v0.5.5",
     ) -> None:
-        """axis: the one whose mirror the history follows. clock_error: of its crystal, relative. extra_ticks, by_page:
-        see the module. capacity: most points in the ring. build: text of its version."""
+        """axis: the one whose mirror the history follows. clock_error: relative error of its crystal, positive if it
+        runs fast. extra_ticks, by_page: see the module. capacity: most points in the ring. build: text of its version.
+        """
         self.history = DacHistory(CENTRE, lines=4)
         self.deaf = False
         """Test knob: whether the firmware hears and says nothing, while its outputs play on."""

@@ -262,7 +262,8 @@ class HeliosModel(DacModel):
     """The firmware. `history` also covers future times, as far as the buffers reach."""
 
     def __init__(self, *, name: str = "Helios 1", version: int = 6, clock_error: float = 0.0, axis: str = "x") -> None:
-        """clock_error: of its crystal, relative. axis: the one whose mirror the history follows."""
+        """clock_error: relative error of its crystal, positive if it runs fast. axis: the one whose mirror the history
+        follows."""
         super().__init__(_SPEC, commands=COMMANDS, replies=REPLIES, points=FRAMES)
         self.shutter = False
         self.bootloader = False

@@ -72,9 +72,8 @@ class NidaqModel(Card):
     """The card and its driver."""
 
     def __init__(self, *, markers: Mapping[int, str] = MARKERS, clock_error: float = 0.0) -> None:
-        """markers: outputs, such as `port0/line0` or `ctr0`, by their line in `history`. clock_error: of the crystal,
-        relative.
-        """
+        """markers: outputs, such as `port0/line0` or `ctr0`, by their line in `history`. clock_error: relative error of
+        the crystal, positive if it runs fast."""
         super().__init__(clock_error)
         self.history = CardHistory(self.outputs["ao0"], {line: self.outputs[name] for line, name in markers.items()})
         self.exported: dict[str, str] = {}

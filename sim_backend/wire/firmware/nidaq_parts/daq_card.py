@@ -24,7 +24,7 @@ class Card:
     name: Final = "Dev1"
 
     def __init__(self, clock_error: float) -> None:
-        """clock_error: of the crystal, relative."""
+        """clock_error: relative error of the crystal, positive if it runs fast."""
         counts = {"ao": ni.AO_CHANNELS, "port0/line": ni.LINES, "ctr": ni.COUNTERS}
         self.outputs = {f"{kind}{n}": Output() for kind, count in counts.items() for n in range(count)}
         self.tasks: dict[str, DaqTask] = {}
