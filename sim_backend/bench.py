@@ -95,7 +95,7 @@ class Bench:
             self._power_w = power_w
 
     def run_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        """Start a program of pulses, played `repeats` times, now."""
+        """Start a program of pulses now, in place of any other. It is played `repeats` times."""
         with self._lock:
             self._aborted = False
             self._program = GateProgram(pulses, repeats, self.now_s())

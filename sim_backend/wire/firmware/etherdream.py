@@ -102,7 +102,7 @@ class EtherDreamModel:
 
     @property
     def fullness(self) -> int:
-        """Number of points in the ring. A stop leaves them there until the next p."""
+        """Number of points in the ring. A stop leaves them there until the next command p."""
         return len(self._ring)
 
     def connected(self, now_s: float) -> None:
@@ -166,7 +166,8 @@ class EtherDreamModel:
                 self._set_rate(self.queued_rates.pop(0), self._next_s - period_s)
 
     def stop_input(self, active: bool, now_s: float) -> None:
-        """Open the interlock (active) or close it: a stop remains until c is sent."""
+        """Open the interlock (active) or close it. A stop remains until the command c is sent with the interlock
+        closed."""
         self.advance(now_s)
         if active:
             self._emergency_stop(BY_INPUT | INPUT_NOW, now_s)
