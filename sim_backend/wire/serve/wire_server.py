@@ -69,8 +69,8 @@ class WireServer(ABC, Generic[Model]):
         """Pull the cable. The open port is lost, and so are bytes on their way."""
 
     def hang(self) -> None:
-        """Let the firmware hang: it takes and sends nothing, and replies on their way are lost. What its outputs are
-        doing goes on."""
+        """Let the firmware hang: it takes and sends nothing, and queued replies are lost. What its outputs are doing
+        goes on."""
         with self.lock:
             self._hung = True
             self._outbox.clear()
