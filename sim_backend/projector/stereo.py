@@ -104,8 +104,8 @@ def _project(
 
 
 def _fill(inverse: Array, albedo: Array) -> None:
-    """Give pixels (width,) of a row to which nothing goes (0) the nearest known one's values, of both sides the farther
-    one's. A row without any known pixel stays open sky."""
+    """Fill the pixels (width,) of a row that nothing goes to (inverse depth 0). They get the values of the nearest
+    known pixel to the left or to the right, whichever is farther away. A row without any known pixel stays open sky."""
     known = np.flatnonzero(inverse > 0)
     if not len(known):
         return
