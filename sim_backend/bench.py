@@ -24,11 +24,11 @@ from sim_backend.mirror_motion import Array, Jitter, Playing, resting
 class BenchState:
     """State of the bench during n frames.
 
-    mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) its velocity, NaN
-    if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool, whether the gate changed during
-    the exposure. backward: (n,) bool, level of the direction signal at the frame's start. line_s, scan_s: times of the
-    rising edges of the line and scan markers in these frames. power_w: laser power that an open gate lets out, 0 if the
-    laser is off. jitter: (n,) or 0, deviation of the mirror from `mirror`.
+    mirror: (n,) mirror position, as a command, in the middle of each exposure. velocity_per_s: (n,) change of the
+    mirror position per second, NaN if unknown. share: (n,) part of the exposure with the gate high. edge: (n,) bool,
+    whether the gate changed during the exposure. backward: (n,) bool, level of the direction signal at the frame's
+    start. line_s, scan_s: times in s of the rising edges of the line and scan markers in these frames. power_w: laser
+    power that an open gate lets out, 0 if the laser is off. jitter: (n,) or 0, deviation of the mirror from `mirror`.
     """
 
     mirror: Array
@@ -68,7 +68,8 @@ class Bench:
         return self._epoch_ns + round(time_s * NS_PER_S)
 
     def play(self, waveform: ScanWaveform, repeats: int, *, latency_s: float, rate_hz: float) -> None:
-        """Play a waveform `repeats` times at `rate_hz` points per second, starting `latency_s` from now."""
+        """Play a waveform `repeats` times at `rate_hz` points per second, starting `latency_s` from now. Until then the
+        command is that of the first point."""
         with self._lock:
             start_s = self.now_s() + latency_s
             self._motion = Playing(waveform, repeats, start_s, rate_hz, self.lag.forward, self.lag.backward)
@@ -94,7 +95,7 @@ class Bench:
             self._power_w = power_w
 
     def run_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
-        """Start a program of pulses, played `repeats` times, now."""
+        """Start a program of pulses now, in place of any other. It is played `repeats` times."""
         with self._lock:
             self._aborted = False
             self._program = GateProgram(pulses, repeats, self.now_s())
@@ -126,8 +127,9 @@ class Bench:
             return SyncStatus("waiting" if self._program.waiting else "running", word)
 
     def during(self, start_s: Array, exposure_s: float, period_s: float) -> BenchState:
-        """State during frames that start at start_s (n,), ascending, about period_s apart. The waveform and the laser
-        power are the present ones."""
+        """State during frames that start at start_s (n,), in s of the bench, ascending, about period_s apart. The
+        waveform and the laser power are the present ones. Ask for frames in ascending order: earlier levels of the gate
+        are dropped."""
         until_s = float(start_s[-1]) + period_s
         with self._lock:
             motion = self._motion

@@ -55,7 +55,8 @@ class EffectDecision:
 
 @dataclass(frozen=True, slots=True)
 class EffectPlan:
-    """The decision on every effect of the catalogue. changes: bound for all those left out as negligible, together."""
+    """The decision on every effect of the catalogue. changes: bound on the share of decisions that all effects left out
+    as negligible can change together."""
 
     planned_for: PlannedFor
     decisions: tuple[EffectDecision, ...]

@@ -1,8 +1,8 @@
 """A report on the effects of a world: whether each is on, why, its share of the photons and its cost; and a row's flux.
 
-An effect's light is the flux with it minus the flux of the effects before it, so the effects' lights add up to the
-flux. Costs are medians of one thread's time, measured on request: light per column, divided among the frames that share
-it; effects on bits per whole frame. Light that does not depend on the laser is computed only once; its cost is 0.
+An effect's light is what it adds to the flux of the effects before it, so the effects' lights add up to the flux. Costs
+are medians of one thread's time, measured on request: light per column, divided among the frames that share it; effects
+on bits per whole frame. Light that does not depend on the laser is computed only once; its cost is 0.
 """
 
 import time
@@ -31,11 +31,11 @@ SPARSITY = 6
 
 
 def effects_report(world: "SimulatedWorld", *, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-    """The report for columns of `exposures` frames at a given power of the laser. Its keys:
+    """The report for columns of `exposures` frames of `exposure_s` each, at the laser power `power_w`. Its keys:
 
     planned_for: power_w (of all lines together), exposure_s (of a column's frames together) and exposures that the
     plan holds for.
-    changed_decisions_bound: for all effects left out together.
+    changed_decisions_bound: bound on the share of decisions that all left-out effects can change together.
     effects: one mapping for each effect of the catalogue, with effect, on, why, share (of the detected photons, before
     saturation, over 16 mirror positions), changed_decisions_bound (None: unknown), removable (whether the world can do
     without it), cost_us_per_frame (None: it is part of a device, of another effect or of the gain).

@@ -15,14 +15,15 @@ Trigger = Callable[[float, float], float | None]
 
 
 class OutputLevels:
-    """Levels of a board's outputs over time: low at first, then what `_times` and `_levels` say."""
+    """Base of models of boards: the levels of a board's outputs over time, as bits of an integer, all low at first. A
+    subclass adds the changes."""
 
     def __init__(self) -> None:
         self._times: list[float] = [-math.inf]
         self._levels: list[int] = [0]
 
     def outputs_at(self, at_s: float) -> int:
-        """Levels of the outputs at a time to which the model has been advanced."""
+        """Levels of the outputs at a time up to which the model has been advanced."""
         return self._levels[bisect_right(self._times, at_s) - 1]
 
     def changes(self, from_s: float, until_s: float) -> list[tuple[float, int]]:
@@ -64,7 +65,7 @@ class GateProgram:
         return not self.ended and self._pulses[self._index].duration_s is None
 
     def advance(self, until_s: float, trigger: Trigger) -> None:
-        """Play on up to `until_s`, that instant excluded."""
+        """Play on up to `until_s`, that instant excluded. trigger: tells when the scan marker is high."""
         while not self.ended:
             duration_s = self._pulses[self._index].duration_s
             if duration_s is None:
@@ -130,9 +131,10 @@ class GateProgram:
 def gate_shares(
     times: Array, words: NDArray[np.int64], start_s: Array, exposure_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Part of each exposure (n,) with the gate high, and whether the gate changed during it.
+    """Part of each exposure (n,) with the gate high, and whether the gate changed during it (n,).
 
     times, words: (m,), outputs from each time on. The first time must not be later than the first exposure's start.
+    start_s: (n,), starts of the exposures.
     """
     high = (words & OUT_GATE) != 0
     changes = times[1:][np.diff(high.astype(np.int8)) != 0]

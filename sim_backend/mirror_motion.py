@@ -48,7 +48,7 @@ class Jitter:
 @dataclass(frozen=True, slots=True, eq=False)
 class Playing:
     """A waveform that is played `repeats` times from `start_s` on, at `rate_hz` (the true rate, clock error included).
-    The command stands at the first point before and at the last point afterwards."""
+    The command is that of the first point before, and that of the last point afterwards."""
 
     waveform: ScanWaveform
     repeats: int

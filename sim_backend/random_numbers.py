@@ -109,7 +109,8 @@ def round_by_table(builder: Any, state: Any, key: Any) -> Any:
 
 
 def round_by_arm(builder: Any, state: Any, key: Any) -> Any:
-    """One AES round of 128 bits on 64-bit ARM, whose instruction adds the key first."""
+    """One AES round of 128 bits on 64-bit ARM. Its instruction adds a key before the round, so it gets 0 there, and the
+    key is added at the end."""
     given, nothing = builder.bitcast(state, _BYTES), ir.Constant(_BYTES, [0] * 16)
     substituted = _call(builder, "llvm.aarch64.crypto.aese", _BYTES, given, nothing)
     mixed = _call(builder, "llvm.aarch64.crypto.aesmc", _BYTES, substituted)
@@ -182,8 +183,8 @@ def _levels_at(builder: Any, address: Any) -> list[Any]:
 
 @numba.njit(cache=True)
 def block_numbers(words: int) -> NDArray[np.uint64]:
-    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16): each block's number
-    twice."""
+    """The block numbers that `drawn_word` takes for each word of a row, uint64 (words, 16). Each block's number is
+    there twice."""
     shape = words, 2 * WORD_PX // BLOCK_PX
     return np.repeat(np.arange(words * WORD_PX // BLOCK_PX), 2).astype(np.uint64).reshape(shape)
 
@@ -249,9 +250,8 @@ _S27, _S30, _S31 = np.uint64(27), np.uint64(30), np.uint64(31)
 
 
 def mixed(z: Any) -> Any:
-    """64 bits, a uint64 or an array of them, each of which depends on all bits of z. Products overflow on
-    purpose; `np.errstate(over="ignore")` keeps numpy from warning of it.
-    """
+    """z with its bits mixed: each bit of the result depends on all bits of z, a uint64 or an array of them. Products
+    overflow on purpose; `np.errstate(over="ignore")` keeps numpy from warning of it."""
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
     return z ^ (z >> _S31)
@@ -303,7 +303,7 @@ def _power_of_half(typing: Any, rounded: Any) -> _Code:
 
 @numba.njit(inline="always", error_model="numpy")
 def power_of_half(t, halving):  # type: ignore[no-untyped-def]
-    """2^-t for t >= 0. halving: `HALVING` of the precision of t."""
+    """2^-t for t >= 0. halving: the entry of `HALVING` for the type of t."""
     most, rounder, e0, e1, e2, e3, e4, e5, e6, e7, e8, e9, e10 = halving
     t = min(t, most)
     rounded = t + rounder
@@ -316,7 +316,7 @@ def power_of_half(t, halving):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always", error_model="numpy")
 def one_minus_exp_minus(t):  # type: ignore[no-untyped-def]
-    """1 - exp(-t) for t >= 0, with the same relative error however small t is."""
+    """1 - exp(-t) for t >= 0. Its relative error is as small for small t as for large ones."""
     t = min(t, LARGEST)
     rounded = t * LOG2_E + _ROUNDER
     k = rounded - _ROUNDER

@@ -109,7 +109,7 @@ MOST_VIEWS, TIME_STEP_S = 64, 1e-3
 
 
 class SimulatedWorld:
-    """One scene, one rig, and the `Bench` of its devices. Reading is safe from any thread."""
+    """One scene, one rig, and the `Bench` of its devices. Methods that set nothing may be called from any thread."""
 
     def __init__(self, config: WorldConfig, surroundings: Surroundings) -> None:
         """Raises DeviceError if the geometry, the scene, its board's pose or the focus cannot be used."""
@@ -157,7 +157,7 @@ class SimulatedWorld:
     def plan_for(self, power_w: float, exposure_s: float, exposures: int) -> None:
         """Choose the effects for columns of `exposures` frames of `exposure_s` each, at `power_w` or less.
 
-        Call it before the SPAD is configured. Otherwise the effects are chosen for `MOST`.
+        Call it before the SPAD is configured. Without a call the effects are chosen for `MOST`.
         """
         frames = exposures + 1  # as many as a column can get, since the clocks are independent
         # Photons of several lines add up: an effect that is negligible for one line of their total power is so for all.
@@ -168,7 +168,8 @@ class SimulatedWorld:
 
     @property
     def effect_plan(self) -> EffectPlan:
-        """The effects that are simulated, and why. Decided by `plan_for` or at first use, once the devices are made."""
+        """The effects that are simulated, and why. They are decided by `plan_for`, or else at first use. Use this only
+        once the devices are made, since devices report effects of their own."""
         return self._plan()[0]
 
     @property
@@ -183,7 +184,7 @@ class SimulatedWorld:
 
     @cached_property
     def sampled_planes(self) -> Array:
-        """Planes (n, 4) of mirror positions spread over the range."""
+        """Light planes nx, ny, nz, d, float64 (n, 4), at n mirror positions spread over the command range."""
         low, high = self.model.scanner.command_range
         return self.model.planes(low + (np.arange(SAMPLED_COLUMNS) + 0.5) * (high - low) / SAMPLED_COLUMNS)
 
@@ -203,24 +204,27 @@ class SimulatedWorld:
 
     def hold_columns(self, commands: Array) -> None:
         """Treat the mirror as held within columns at these mirror commands (columns,): all frames of a column get the
-        light of one position, jitter apart.
+        light of one position, apart from jitter.
 
-        Call it before the run. Without it and `command_grid`, the stripe moves in steps of about a quarter of a pixel.
+        Call it before the run. Unless it is called or the config has a `command_grid`, the stripe moves in steps of
+        about a quarter of a pixel.
         """
         self.grid = column_grid(commands, self.model.scanner.command_range)
 
     def cover_lens(self) -> None:
         """Let no more light in. Dark counts and effects on bits remain if the config wants them, even if negligible.
 
-        Call it before the SPAD is configured. A later `plan_for` with other values undoes it.
+        Call it before the SPAD is configured. `effect_plan` stays as it was. A later `plan_for` with other values
+        undoes the call.
         """
         kept = [entry for entry in CATALOGUE if entry.of_sensor or entry.kind == "bits"]
         wanted = [e for e in kept if e.called(self.setting)[0] and is_active(e.name, self.config.effects)]
         self._planned = self._plan()[0], FluxModel(self.setting, wanted)
 
     def mirror_positions(self, state: BenchState, period_s: float) -> Array:
-        """Mirror positions (n,) whose light the n frames of `state` get: for each frame the mean position of all frames
-        in its cell of `grid`, plus its own jitter, limited to the command range. period_s: from frame to frame.
+        """Mirror positions (n,) from which the n frames of `state` get their light. The position of a frame is the mean
+        one of all frames in its cell of `grid`, plus the frame's own jitter, limited to the command range. period_s:
+        from frame to frame.
 
         If rows are exposed one after the other, (n, 2) for the first and the last row. NaN outside the grid.
         """
@@ -243,8 +247,8 @@ class SimulatedWorld:
     def truth(self, commands: Array, velocity_per_s: float = 0.0, time_s: Array | None = None) -> SweepTruth:
         """The true position of a single line's stripe for each column, and the depth of every pixel.
 
-        Arguments as in `World.truth`. If surfaces move, a column's stripe is that of the column's time, and a pixel's
-        depth that of the time at which the line passed the pixel.
+        Arguments as in `drivers.interfaces.World.truth`. If surfaces move, a column's stripe is that of the column's
+        time, and a pixel's depth that of the time at which the line passed the pixel.
         """
         first = np.asarray(commands, dtype=np.float64)
         held = np.stack([first, first + velocity_per_s * self._frame_delay_s], axis=-1)
@@ -265,7 +269,8 @@ class SimulatedWorld:
         return SweepTruth(x_px=x_px, depth_m=depth, trusted=self.surfaces.trusted)
 
     def effects_report(self, power_w: float, exposure_s: float, exposures: int) -> dict[str, Any]:
-        """Each effect as planned: on or off, why, its share of the photons, what it can change and what it costs."""
+        """Each effect as planned: on or off, why, its share of the photons, what it can change and what it costs.
+        Arguments and keys are those of `sim_backend.effects_report.effects_report`."""
         from sim_backend.effects_report import effects_report
 
         return effects_report(self, power_w=power_w, exposure_s=exposure_s, exposures=exposures)
@@ -281,10 +286,11 @@ class SimulatedWorld:
         self, *, rows: ArrayLike, columns: int, command_range: tuple[float, float], power_w: float, rule: Rule,
         seed: int, depth_range_m: tuple[float, float], spad_frame_s: float = 1e-5,
     ) -> "SimulatedApparatus":  # fmt: skip
-        """The scene before other light sources and cameras, at time 0: see `rig.strategies.apparatus.MakesApparatus`.
+        """An apparatus with light sources and cameras of other kinds in front of the scene. Its time begins at 0.
+        Arguments are explained, and errors named, in `rig.strategies.apparatus.MakesApparatus`.
 
         The light transport of the latest rows, columns and command range is kept. Effects are those that the scene
-        calls for, except such as are negligible up to `LONGEST`.
+        calls for, except those that are negligible up to `LONGEST`.
         """
         from sim_backend.projector.apparatus import Hardware, Request, SimulatedApparatus
 
@@ -307,7 +313,7 @@ class SimulatedWorld:
         return kept[1:]
 
     def photons(self, times: FrameTimes, seed: int, threads: int) -> PhotonSource:
-        """A source of frames with this timing. threads: most threads that it uses."""
+        """A source of frames with this timing; the caller closes it. threads: most threads that it uses."""
         model = self.model
         return PhotonSource(self.flux_model, model.sheets, times, seed, threads, self.fan, model.scanner.command_range)
 
@@ -330,7 +336,7 @@ def _in_steps(time_s: Array) -> Array:
 
 
 def surface_passed(still: CameraView, x_px: NDArray[np.float32], at_s: Array) -> Array:
-    """Inverse depth (rows, width) that every pixel saw when the line passed it. still: the view at time 0.
+    """Inverse depth in 1/m (rows, width) that every pixel saw when the line passed it. still: the view at time 0.
 
     x_px: (rows, columns), the stripe; at_s: (columns,), times of the bench. A pixel between stripes has the time of the
     nearest one, and a row without stripes the median time.
@@ -369,13 +375,15 @@ def _load_geometry(path: Path) -> RigModel:
 
 
 def bench_of(surroundings: Surroundings) -> Bench:
-    """The simulated world's `Bench`. Without such a world, a new one for a simulated device among real ones."""
+    """The simulated world's `Bench`. If the rig has no simulated world, a new one, for a simulated device among real
+    ones."""
     world = surroundings.world
     return world.bench if isinstance(world, SimulatedWorld) else Bench(surroundings.clock, Lag())
 
 
 def note_effect(surroundings: Surroundings, effect: str, why: str) -> None:
-    """Tell a simulated world that a device has an effect, of kind `within` in the catalogue, and why."""
+    """Tell a simulated world that a device has an effect, of kind `within` in the catalogue, and why. Other worlds are
+    told nothing."""
     if isinstance(surroundings.world, SimulatedWorld):
         surroundings.world.setting.devices[effect] = why
 

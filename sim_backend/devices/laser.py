@@ -21,7 +21,7 @@ class SimulatedLaserConfig(KindConfig):
 
 
 def create(config: SimulatedLaserConfig, surroundings: Surroundings) -> PlainLaser:
-    """The laser, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
+    """The laser. It acts on the simulated world's bench, or on a new bench if the rig has no simulated world."""
     return PlainLaser("simulated laser", config.max_power, bench_of(surroundings).emit)
 
 

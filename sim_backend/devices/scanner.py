@@ -94,7 +94,8 @@ class SimulatedScanner(BeamScanner):
 
 
 def create(config: SimulatedScannerConfig, surroundings: Surroundings) -> SimulatedScanner:
-    """The scanner, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
+    """The scanner. It acts on the simulated world's bench, or on a new bench if the rig has no simulated world. The
+    bench gets the jitter of the config, and the world is told of lag and jitter."""
     bench = bench_of(surroundings)
     bench.jitter = Jitter(config.jitter, surroundings.seed)
     forward_us, backward_us = 1e6 * bench.lag.forward, 1e6 * bench.lag.backward

@@ -101,7 +101,7 @@ class TickClock:
     """
 
     def __init__(self, tick_s: float, start_s: float, error: float, wander: float, seed: list[int]) -> None:
-        """tick_s: the nominal time between ticks."""
+        """tick_s: the nominal time between ticks. seed: of the rate's random change."""
         self._tick_s = tick_s
         self._step_ticks = max(1, round(STEP_S / tick_s)) if wander else np.iinfo(np.int64).max
         self._sd = wander * np.sqrt(self._step_ticks * tick_s)

@@ -22,7 +22,7 @@ class SimulatedSyncConfig(KindConfig):
 
 
 class SimulatedSync(SyncSource):
-    """Tells the bench, the state that simulated devices share, what the gate does."""
+    """The simulated sync source. It tells the bench, the state that all simulated devices share, what the gate does."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__("simulated sync")
@@ -31,7 +31,7 @@ class SimulatedSync(SyncSource):
 
     @property
     def resolution_s(self) -> float:
-        """The resolution, 10 ns."""
+        """Step to which durations of pulses are rounded, 10 ns."""
         return RESOLUTION_S
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
@@ -58,7 +58,7 @@ class SimulatedSync(SyncSource):
 
 
 def create(config: SimulatedSyncConfig, surroundings: Surroundings) -> SimulatedSync:
-    """The sync source, on the bench that `bench_of` gives: the simulated world's, or without one a new bench."""
+    """The sync source. It acts on the simulated world's bench, or on a new bench if the rig has no simulated world."""
     return SimulatedSync(bench_of(surroundings))
 
 

@@ -55,7 +55,8 @@ def phase(lobes: Lobes, cosine: Array | float) -> Array:
 
 
 def scattered_once(lobes: Lobes, share: float, haze: bool) -> Array:
-    """The band k of light scattered once, of the haze or else of a wall: (depths, `PLACES`), per unit of tangent."""
+    """The band k of light scattered once, (depths, `PLACES`), per unit of tangent. share: scattering over extinction.
+    haze: whether the haze's light is spread, or else a wall's."""
     node, weight = np.polynomial.legendre.leggauss(NODES)
     # Cubes put nodes where most light comes from: near the wall, and near the row.
     node, weight = ((node + 1) / 2) ** 3, 1.5 * weight * ((node + 1) / 2) ** 2
@@ -75,7 +76,8 @@ def shapes(lobes: Lobes, share: float, baseline: float) -> tuple[Array, Array, A
     """Light scattered more than once around the end of a sheet, each (depths, `PLACES`).
 
     share: scattering over extinction. baseline: optical depth from scanner to camera. Returns the halo per unit of
-    tangent, the same on both sides, stripe = 1; and the spread haze before its end and behind it, haze at its end = 1.
+    tangent, equal on both sides, relative to the stripe; and the spread haze before its end and behind it, relative to
+    the haze at its end.
     """
     mean_cosine, depth = sum(w * g for w, g in lobes), DEPTHS[:, None]
     reduced = (share * depth * (1 - mean_cosine)) ** 2
@@ -98,8 +100,8 @@ def shapes(lobes: Lobes, share: float, baseline: float) -> tuple[Array, Array, A
 
 
 def totals(lobes: Lobes, share: float, reach: float) -> tuple[Array, Array]:
-    """All light scattered more than once where everything within an angle is lit, (depths,) each: that of the surface
-    (surface = 1), and of the haze from this depth (haze scattered once = 1).
+    """Light scattered more than once, in total, if everything within an angle is lit: from a surface, relative to the
+    surface's own light, and from the haze there, relative to haze scattered once. Each is (depths,), for `DEPTHS`.
 
     These are sums of the bands of `shapes`, since every line of a lit surface sends its band to all others. reach:
     tangent of the half angle that is lit.

@@ -31,9 +31,8 @@ def dark_counts(setting: Setting) -> Array:
 
 
 def dark_rates(sensor: Sensor, size: tuple[int, ...]) -> Array:
-    """Dark counts per second of every pixel, float64 of shape `size` (rows, width). The same sensor always gets the
-    same rates.
-    """
+    """Dark counts per second of every pixel, float64 of shape `size` (rows, width). They depend on the sensor's
+    settings alone."""
     rng = np.random.default_rng(sensor.pixel_seed)
     ordinary = np.exp(_BODY_SD * rng.standard_normal(size))
     hot = rng.random(size) < _TAIL_SHARE * (_TAIL_START / _TAIL_AT) ** -_TAIL_POWER

@@ -60,7 +60,7 @@ class Halo:
         self._tables = *tables, *(np.ascontiguousarray(table[:, ::-1]) for table in tables)
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         view = self._view.at(sheet.time_s).arrays
         _add_halo(view, sheet.traced, self._light, self._tables, first_row, last_row, rate)
 

@@ -7,7 +7,8 @@ inverse depth of a ray q = (u, v, 1) is
 
 That pixel is searched for from two depths, the scene's nearest and the one that the ray had at time 0; the nearer
 result is used, which is right except for a pixel or two along edges. Newly uncovered areas continue the surface behind.
-Areas that enter the picture continue that at its border. Albedo is that of the nearest pixel. All arrays are float64.
+Areas that enter the picture continue the surface at its border. Albedo is that of the nearest pixel. All arrays are
+float64.
 
 The view is computed anew every `HOLD_S`, in which a surface at 10 m/s moves by 1 cm. This takes about 40 ms for
 512 x 512 pixels. Light that does not come from the laser stays that of time 0.
@@ -33,7 +34,8 @@ SEARCH_STEPS = 3
 
 
 class MovingSurfaces:
-    """Makes the view at a given time. Keeps the latest views, since threads that draw rows are at different times."""
+    """Makes the view at a given time. Thread-safe. Keeps the latest views, since threads that draw rows are at
+    different times."""
 
     def __init__(self, velocity_m_per_s: Sequence[float]) -> None:
         """velocity_m_per_s: along x (right), y (down), z (away from the camera)."""

@@ -46,7 +46,8 @@ HOLD_S = 2e-4
 
 @numba.njit(cache=True, nogil=True)
 def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, float, float]:
-    """Pixel (x, y) whose ray has the given tangents, and the area of a pixel in tangents there; NaN if there is none.
+    """Place (x, y) in pixels at which the ray has the given tangents, and the area of a pixel there, in tangents. NaN
+    if there is no such place.
 
     Uses Newton's method on the maps of tangents (rows, width), extended linearly beyond their borders.
     """
@@ -74,7 +75,8 @@ def find_pixel(u: Array, v: Array, at_u: float, at_v: float) -> tuple[float, flo
 
 @numba.njit(cache=True, nogil=True)
 def share(pixel: int, first: float, length: float, sigma: float) -> float:
-    """Share of a streak (first..first + length, blurred by sigma) that falls within a pixel, in one dimension."""
+    """Share of a streak that falls within a pixel, in one dimension. The streak goes from `first` over `length`,
+    blurred by `sigma`, all in pixels."""
     a, b = pixel - 0.5 - first, pixel + 0.5 - first
     if length < SHORT_PX:
         middle = 0.5 * length

@@ -34,16 +34,15 @@ def log_miss(probability: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def next_hit(place: float, key: np.uint64, draw: int, log_miss: float) -> float:
-    """The next hit after `place` (-1: the first hit), infinity if p is 0. draw: number of this random draw, 0, 1, 2,
-    ..., in the key's stream. log_miss: ln(1 - p).
-    """
+    """The next hit after `place`, infinity if p is 0. A place of -1 gives the first hit. draw: number of this random
+    draw, 0, 1, 2, ..., in the key's stream. log_miss: ln(1 - p)."""
     uniform = (float(frame_key(key, np.uint64(draw)) >> np.uint64(11)) + 0.5) * 2.0**-53
     return place + 1.0 + math.floor(math.log(uniform) / log_miss) if log_miss < 0.0 else math.inf
 
 
 @numba.njit(cache=True, nogil=True)
 def bit_of(x: int) -> np.uint64:
-    """The bit of pixel x in its word, x // 64 of the row (`packbits` order in a little-endian word)."""
+    """The bit of pixel x within its word, which is word x // 64 of the row (`packbits` order, little-endian words)."""
     return np.uint64(1) << np.uint64((x % WORD_PX) ^ 7)
 
 
@@ -61,7 +60,7 @@ class Crosstalk:
     Acts on the bits of photons, dark counts and afterpulses. Each detection of a frame fires each of its 4 neighbours
     with probability c / 4 (c: `crosstalk`), all independently. Pixels fired in this way trigger no others, an effect of
     order c^2. A pixel that fires by itself with probability p and has m neighbours that fired is 1 with probability
-    1 - (1 - p)(1 - c/4)^m. If all pixels have the same small p, that is on average p (1 + c). Light that leaves the
+    1 - (1 - p)(1 - c/4)^m. If p is small and equal in all pixels, that is on average p (1 + c). Light that leaves the
     array is lost. c is 0.1 to 0.2 % in 512 x 512 arrays of large pitch; the share beyond 4 neighbours is not modelled.
 
     Exact for any c. Each pixel has four possible transfers (up, down, left, right), numbered pixel by pixel; the gaps
@@ -102,14 +101,14 @@ def _spark_over(words: Words, width: int, seed: np.uint64, first_frame: int, log
 
 
 def defects(sensor: Sensor, size: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The dead and the hot pixels, two masks of shape `size` (rows, width). The same sensor always gets the same."""
+    """The dead and the hot pixels, masks of shape `size` (rows, width) that depend on the sensor's settings alone."""
     # One random number a pixel for both, so that a larger share includes all pixels of a smaller one.
     lot = np.random.default_rng([sensor.pixel_seed, _DEFECTS]).random(size)
     return lot < sensor.dead_share, lot >= 1 - sensor.hot_share
 
 
 class Defects:
-    """Hot and dead pixels, whose electronics read 1 or 0 in every frame, whatever their diode does.
+    """Hot pixels read 1 and dead pixels read 0 in every frame, whatever their diodes do.
 
     Acts on the bits in the pixels' memories, after crosstalk and all other effects between diodes. A real colour SPAD
     has 4 % of defective pixels (crop of 254 x 496, public data of wision-lab/photoncube) without clusters: pairs of

@@ -31,9 +31,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class PlannedFor:
-    """The largest values that a plan holds for: laser power in W, exposure of a column's frames together in s, and the
-    number of these frames.
-    """
+    """The largest values that a plan holds for: laser power in W, of all lines together; exposure of a column's frames
+    together in s; and the number of these frames."""
 
     power_w: float
     exposure_s: float
@@ -60,6 +59,7 @@ class LaserEffect(Protocol):
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
         """Add detections per second and watt to `rate` (rows, width), rows first_row..last_row-1. Releases the GIL.
+        `sheet` has been traced on these rows.
 
         `rate` holds what earlier effects of the catalogue have added for this sheet; an effect may change that light.
         `rate` is float64, or float32 when frames are drawn; seven digits are more than photons can show.

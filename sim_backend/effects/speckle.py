@@ -56,7 +56,8 @@ def _uniform(key: np.uint64, number: int) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def gamma_of(key: np.uint64, shape: float) -> float:
-    """A gamma variate of mean 1 and the given shape, at least 1, determined by the key (Marsaglia and Tsang 2000)."""
+    """A gamma variate of mean 1 that the key determines (Marsaglia and Tsang 2000). shape: of the distribution, at
+    least 1."""
     d = shape - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
     number = 0

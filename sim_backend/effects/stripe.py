@@ -52,7 +52,7 @@ class Stripe:
         self._light = setting.gain / math.pi / setting.line.fan, setting.scene.extinction_per_m
 
     def add(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt of laser power."""
+        """See `LaserEffect`."""
         light = *self._light, self._turned_per_m, self._angle_px
         _add_lines(self._view.at(sheet.time_s).arrays, sheet.traced, light, self._width, first_row, last_row, rate)
 

@@ -6,10 +6,10 @@ with the flux lambda and the probability p that the pixel's bit is 1. `share` is
 the gate let light out. `steady` are detections per second without the laser, computed once; `sheet` are the laser's
 detections per second and watt, computed once per command.
 
-Tracing the light costs more than drawing a frame. So the frames that the mirror spends in one cell of a grid
-(`CommandGrid`) all get their mean position; the mean position over a column's frames is then that of the moving mirror.
-If the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per pixel
-of width.
+Tracing the light costs more than drawing a frame. So all frames that are exposed while the mirror is in one cell of a
+grid (`CommandGrid`) get their mean position; the mean position over a column's frames is then that of the moving
+mirror. If the columns' commands are known the cells are the columns; otherwise the range is divided into four cells per
+pixel of width.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -57,8 +57,8 @@ class FluxModel:
         return fewer
 
     def add_sheet(self, sheet: LightSheet, first_row: int, last_row: int, rate: Array) -> None:
-        """Add detections per second and watt from the sheet to rows first_row to last_row - 1 of `rate` (rows, width).
-        Releases the GIL."""
+        """Add detections per second and watt from a traced sheet to rows first_row to last_row - 1 of `rate` (rows,
+        width). Releases the GIL."""
         for effect in self.laser.values():
             effect.add(sheet, first_row, last_row, rate)
 
@@ -98,8 +98,8 @@ class CommandGrid:
     high: float
 
     def hold(self, commands: Array, steps: Array) -> Array:
-        """For frames at commands (n,): the mean position that the frames in a frame's cell would have if the mirror
-        crossed the cell at this frame's step; NaN outside the grid.
+        """Positions for frames at commands (n,); NaN outside the grid. A frame gets the mean position of all frames
+        that would lie in its cell if the mirror crossed the cell in steps of this frame's length.
 
         steps: (n,) how far the mirror moves from one frame to the next. A frame with step 0, or alone in its cell,
         keeps its own position. If its step is NaN (unknown), a frame gets the cell's own position.

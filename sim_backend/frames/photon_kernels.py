@@ -87,10 +87,10 @@ def set_levels(
 ) -> None:  # fmt: skip
     """Set the levels of rows, in place, for p = 1 - exp(-(steady + exposure_w_s rate)).
 
-    steady: photons per exposure; rate: per second and watt, both (rows, width), not negative; exposure_w_s: power times
-    time. In each row, the words of 64 pixels before the first word with laser light and after the last one take their
-    levels from `dark`, unless `dark` has no rows. lit (rows, words) says which words of `levels` may differ from
-    `dark`; the call updates it.
+    steady: detections per exposure without the laser; rate: the laser's, per second and watt; both (rows, width), not
+    negative. exposure_w_s: power times time. In each row, the words of 64 pixels before the first word with laser light
+    and after the last one take their levels from `dark`, unless `dark` has no rows. lit (rows, words) says which words
+    of `levels` may differ from `dark`; the call updates it.
     """
     rates, constants = (rate, rate.view(np.uint32), np.float32(exposure_w_s)), (ROUGHLY, _LEVELING)
     _set_levels(steady, rates, rows, dark, lit, levels, constants)

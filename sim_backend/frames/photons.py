@@ -47,7 +47,8 @@ class _Span:
 
 
 class PhotonSource:
-    """Draws the frames of a configured SPAD. Call it from one thread, which is one of the up to `threads` used."""
+    """Draws the frames of a configured SPAD. Call its methods from one thread only. That thread works too: it is one of
+    the `threads` that draw at the same time."""
 
     def __init__(
         self,

@@ -63,7 +63,7 @@ class LineFan:
         """For each of n mirror positions, the sheets of the lines, not traced yet. A line that is beyond the limits on
         any row gives no sheet, and a position that is NaN gives none at all.
 
-        held: (n,), or (n, 2) for the exposure of the first and last row. moment_s: (n,) times, for what moves.
+        held: (n,), or (n, 2) for the exposure of the first and last row. moment_s: (n,) times in s, for what moves.
         """
         ends = held if held.ndim == 2 else held[:, None]
         down = np.linspace(0, 1, rows) if ends.shape[1] > 1 else np.zeros(1)

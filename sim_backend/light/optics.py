@@ -1,4 +1,4 @@
-"""Lens, sensor and laser line of the simulated rig, and the detections that they make of light.
+"""Lens, sensor and laser line of the simulated rig, and the number of detections that light causes.
 
 Detections per second of a pixel that sees radiance L:  FF PDP T (pi/4)/N^2 pitch^2 L / (h c / wavelength), with fill
 factor FF, detection probability PDP, transmission T and f-number N.

@@ -85,7 +85,8 @@ class LightSheet:
 
 
 def empty_sheet(planes: Array, rows: int, time_s: float = 0.0, bowed: LightSheets | None = None) -> LightSheet:
-    """A sheet that has not been traced on any row yet. planes: (4,) or (1, 4) nx, ny, nz, d, or (rows, 4).
+    """A sheet that has not been traced on any row yet. planes: nx, ny, nz, d; (4,) or (1, 4) for all rows together, or
+    (rows, 4).
 
     bowed: (rows,) the bowed sheets that the planes belong to, None if they are flat.
     """

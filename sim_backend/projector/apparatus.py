@@ -9,8 +9,8 @@ A source of power P shows a pattern with relative brightness b_c in column c. Th
     rule "irradiance":   P b_c / (columns / 2)                    as bright as P spread over half of the columns
 
 If the patterns of rows differ, the sum is averaged over the rows. A column is a whole line over the fan's angle. A spot
-is the part of a line in one row, but it has the power of the whole line. So it is brighter than the line by a factor,
-the number of rows over which the fan spreads.
+is the part of a line in one row. Under the rule "energy" it has the power of the whole line, so it is brighter than the
+line by the number of rows over which the fan spreads. Under the rule "irradiance" it is as bright as the line.
 """
 
 from collections.abc import Iterator
@@ -41,7 +41,7 @@ MULTIPLE = "halo"
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """The hardware that only other ways of measuring depth need."""
+    """Settings of the hardware for ways of measuring depth without a scanned line."""
 
     camera: ConventionalCamera
     pulses: PulsedSource
@@ -53,6 +53,8 @@ class Request:
 
     power_w: power of the source. rule: how light is shared. seed: of all random draws. depth_range_m: nearest and
     farthest depth, which decides the gate of the pulsed source. frame_s: time of a frame of the SPAD.
+
+    Raises ValueError for impossible values.
     """
 
     power_w: float
@@ -74,7 +76,7 @@ class Request:
 
 
 class SimulatedApparatus:
-    """One camera, one light source, one scene."""
+    """One camera, one light source, one scene. Call its methods from one thread only: they share a random generator."""
 
     def __init__(self, transport: Transport, flux: FluxModel, hardware: Hardware, request: Request) -> None:
         """flux: the effects that the transport was computed with."""
@@ -133,7 +135,8 @@ class SimulatedApparatus:
         """Show patterns one after the other, each for one exposure of the conventional camera: uint16 (patterns, rows,
         width), 0 to `camera_full_scale`.
 
-        patterns: as in `spad_counts`. Raises ValueError if the exposure is shorter than `camera_frame_s`.
+        patterns: as in `spad_counts`. Raises ValueError for other ones, and for an exposure shorter than
+        `camera_frame_s`.
         """
         shown = self._checked(patterns)
         self._check_exposure(exposure_s)
@@ -156,9 +159,9 @@ class SimulatedApparatus:
         """Light single spots one after the other, each for some frames of the SPAD. Returns uint32 (spots, width), the
         counts of each spot's own row.
 
-        rows: (spots,) indices into `rows`; columns: (spots,). brightness: share of the power. Light that a spot
-        scatters into other rows is not in the result. Raises ValueError for spots outside the picture, and for a
-        brightness that is not above 0 or is above 1.
+        rows: (spots,) indices into `rows`; columns: (spots,). brightness: relative, 1 for the full power or irradiance.
+        Light that a spot scatters into other rows is not in the result. Raises ValueError for spots outside the
+        picture, and for a brightness that is not above 0 or is above 1.
         """
         if not 0 < brightness <= 1:
             raise ValueError(f"brightness of spots is {brightness:g}; it is above 0 and at most 1")
@@ -188,8 +191,8 @@ class SimulatedApparatus:
         """Light the whole picture with short pulses, one per frame of the SPAD, and time the first photon that each
         pixel detects after each pulse (see `sim_backend.projector.pulse`).
 
-        Raises ValueError for less than one pulse, for bins that are longer than the gate, and if the counts would need
-        too much memory.
+        Raises ValueError for less than one pulse, for bins that are not above 0 s or are longer than the gate, and if
+        the counts would need too much memory.
         """
         (number,) = _frames(np.array([pulses]), 1).tolist()
         power_w = self._request.power_w * (2 if self._request.rule == "irradiance" else 1)

@@ -137,7 +137,9 @@ class SensorBits:
         """Whether the bits stay as they are."""
 
     def flux(self, flux: Array, rows: slice | NDArray[np.int64]) -> Array:
-        """The flux (rows, patterns, width) with which the bits of a perfect sensor would be 1 just as often."""
+        """The flux (rows, patterns, width) with which the bits of a perfect sensor would be 1 as often as this
+        sensor's; infinite for a pixel that always reads 1. rows: the places of the flux's rows among the measured rows.
+        """
         if self.none:
             return flux
         p = -np.expm1(-flux)

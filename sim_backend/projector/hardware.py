@@ -1,4 +1,4 @@
-"""Settings of the hardware that only other ways of measuring depth need: a conventional camera and a pulsed source.
+"""Settings of hardware for ways of measuring depth without a scanned line: a conventional camera and a pulsed source.
 
 The camera's defaults are those of a common industrial sensor with a global shutter, Sony IMX174, by EMVA 1288
 measurements of Point Grey ("Sony Pregius global shutter CMOS imaging performance", 2015): quantum efficiency 77 % at

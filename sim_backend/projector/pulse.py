@@ -15,8 +15,8 @@ time. sigma is the extinction without the light that is only scattered forward: 
 way, it gains from the paths beside it, as the flash lights them too.
 
 Light scattered more than once multiplies both by 1 + M. M is that of `beam_spread.totals` at the optical depth of R or
-r (as if all of the picture were that far away). The additional light of the surface has made a detour. Its length has
-an exponential distribution with the mean
+r (as if all of the picture were that far away). The additional light of the surface has made a detour. Half of the
+length that it adds to the way there and back has an exponential distribution with the mean
 
     DETOUR (1 - mean cosine) (1 + DETOUR_GROWTH sigma R) R
 
@@ -69,10 +69,10 @@ LEAST_RANGE_M = 1e-3
 class Echoes:
     """Light of pulses that comes back to the pixels of chosen rows, float64 (rows, width).
 
-    range_m: distance of the surface, infinite if there is none. surface_per_j: detections of the surface per joule of a
-    pulse, by light that was not scattered. late_per_j: the same by light that was scattered. detour_m: half of the mean
-    length by which its way there and back is longer. steady_per_s: detections per second without the source. fog: light
-    of the medium. stretch: smallest and largest ratio of distance to depth.
+    range_m: distance of the surface, infinite if there is none. surface_per_j, late_per_j: detections per joule of a
+    pulse, by light from the surface that was not scattered, and by light from it that was scattered. detour_m: half of
+    the mean length that scattering adds to the way there and back. steady_per_s: detections per second without the
+    source. fog: light of the medium. stretch: smallest and largest ratio of distance to depth.
     """
 
     range_m: Array
@@ -167,7 +167,7 @@ def _back_per_m_sr(what: Rain | Snow) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Time bins after a pulse. sigma_s: blur of arrival times, one standard deviation."""
+    """Time bins after the middle of a pulse has left. sigma_s: blur of arrival times, one standard deviation."""
 
     start_s: float
     bin_s: float
@@ -194,8 +194,8 @@ def gate(source: PulsedSource, depth_range_m: tuple[float, float], stretch: tupl
 def first_photons(
     rng: np.random.Generator, back: Echoes, gate: Gate, pulses: int, pulse_j: float, bits: SensorBits
 ) -> NDArray[np.uint32]:
-    """Number of first photons by time bin, uint32 (rows, width, bins). Dead pixels detect none, hot ones fire when the
-    gate opens. Raises ValueError if the counts would take more than `MOST_BYTES`."""
+    """Number of first photons of all pulses by time bin, uint32 (rows, width, bins). Dead pixels detect none, hot ones
+    fire when the gate opens. Raises ValueError if the counts would take more than `MOST_BYTES`."""
     rows, width = back.range_m.shape
     if 4 * rows * width * gate.bins > MOST_BYTES:
         raise ValueError(
@@ -230,8 +230,8 @@ def mean_detections(times: tuple[float, float, float], echo: Array, fog: Array, 
     """Write into mean (bins,) the average detections of a pulse in each bin, as if no photon made the pixel blind.
 
     times: in s, start of the first bin, length of a bin, and blur. echo: (5,), detections of the surface by light not
-    scattered and by light scattered, distance of the surface, mean detour, and steady detections per second. fog:
-    detections of the medium, (bins, parts).
+    scattered and by light scattered, then range_m, detour_m and steady_per_s as in `Echoes`. fog: detections of the
+    medium, (bins, parts).
     """
     start_s, bin_s, sigma_s = times
     surface, late, range_m, detour_m, steady_per_s = echo

@@ -5,10 +5,9 @@ It has the rays of the first, so from its place S it sees a point X in the direc
 pixel of the first camera, and a tangent plane (facet). A pixel covers a strip of this plane in its row, and the strip
 covers an interval of the second picture. There the nearest of all strips is seen, with the albedo at that very place.
 Rows are assumed to be rectified: a point is in the same row of both pictures. With a lens that distorts this is true
-only in the middle rows.
-Some pixels of the second picture see places that are hidden from the first camera, so no strip covers them. They get
-the values of the nearest covered pixel to the left or to the right, of the two the one that is farther away from the
-camera. Computing time: 40 ms for 512 x 512 pixels.
+only in the middle rows. Some pixels of the second picture see places that are hidden from the first camera, so no strip
+covers them. They get the values of the nearest covered pixel to the left or to the right, whichever of the two sees the
+farther surface. Computing time: 40 ms for 512 x 512 pixels.
 
 In ambient light alone a surface of albedo rho at the distance r has the radiance rho/pi E exp(-sigma r), and the air in
 front of it adds airlight, as in `sim_backend.effects.ambient`.
@@ -105,8 +104,8 @@ def _project(
 
 
 def _fill(inverse: Array, albedo: Array) -> None:
-    """Give pixels (width,) of a row to which nothing goes (0) the nearest known one's values, of both sides the farther
-    one's. A row without any known pixel stays open sky."""
+    """Fill the pixels (width,) of a row that nothing goes to (inverse depth 0). They get the values of the nearest
+    known pixel to the left or to the right, whichever is farther away. A row without any known pixel stays open sky."""
     known = np.flatnonzero(inverse > 0)
     if not len(known):
         return

@@ -67,8 +67,9 @@ FEW = 8
 class Moment:
     """Light of drops and flakes at one moment, as a sparse matrix.
 
-    first, number: of each column and row, the first entry and the number of entries. x, value: of each entry, the pixel
-    (int32) and the detections per second and watt (float32)."""
+    first, number: (columns, rows), index of the first entry of a column and row, and number of its entries. x, value:
+    (entries,), pixel (int32) and detections per second and watt (float32).
+    """
 
     first: NDArray[np.int64]
     number: NDArray[np.int64]
@@ -77,7 +78,7 @@ class Moment:
 
 
 class Transport:
-    """The light of every column in chosen rows. Reading is safe from any thread."""
+    """The light of every column in chosen rows. Any thread may call its methods."""
 
     def __init__(self, model: RigModel, flux: FluxModel, rows: Rows, commands: Array) -> None:
         """rows: image rows, ascending. commands: (columns,) mirror commands of the columns.
@@ -213,7 +214,8 @@ class Transport:
         return found
 
     def at_moment(self, light: Float32, watts: Float32, rows: slice, moment: Moment | None) -> Float32:
-        """The light (rows of the slice, patterns, width) of `of_patterns` with that of drops and flakes at a moment."""
+        """The light (rows of the slice, patterns, width) of `of_patterns` with that of drops and flakes at a moment;
+        `light` itself if the moment is None."""
         if moment is None:
             return light
         found = light.copy()
@@ -317,6 +319,7 @@ def checked_columns(columns: int, command_range: tuple[float, float], limits: tu
 
 
 def blocks(rows: int, patterns: int, width: int, most_bytes: int = 1 << 22) -> Iterator[slice]:
-    """Slices of rows. The light of a slice in all patterns takes about `most_bytes` of memory."""
+    """Slices of rows. The light of a slice in all patterns takes at most `most_bytes` of memory, unless one row takes
+    more."""
     step = max(1, most_bytes // max(1, 4 * patterns * width))
     return (slice(first, min(first + step, rows)) for first in range(0, rows, step))

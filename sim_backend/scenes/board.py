@@ -74,7 +74,7 @@ def load_boards(shown: Sequence[SceneBoard], folder: Path) -> list[BoardAtPose]:
 
 
 def board_scene(u: Array, v: Array, boards: Sequence[BoardAtPose], wall_m: float) -> Surfaces:
-    """The boards, nearer ones in front, before a wall `wall_m` away, for a camera of rays (u, v), each (rows,
+    """The boards, nearer ones in front, and a wall `wall_m` away behind them, for a camera of rays (u, v), each (rows,
     width)."""
     depth, albedo = np.full(u.shape, wall_m), np.full(u.shape, WALL_ALBEDO)
     slopes = [(np.gradient(tangent, axis=1), np.gradient(tangent, axis=0)) for tangent in (u, v)]

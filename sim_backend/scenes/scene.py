@@ -32,7 +32,7 @@ class AmbientLight(Section):
 
 
 class SceneMotion(Section):
-    """Uniform motion of all surfaces together, from time 0 on, when the simulated world is made."""
+    """Uniform motion of all surfaces together, from time 0 on, which is when the simulated world is made."""
 
     velocity: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] = Field(examples=["[0 m/s, 0 m/s, -2 m/s]"])
     """Velocity along x (right), y (down), z (away from the camera)."""

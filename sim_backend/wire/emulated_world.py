@@ -70,7 +70,8 @@ LOOK_S = 10e-6
 
 
 class EmulatedWorldConfig(WorldConfig):
-    """Config of the world with emulated devices, whose ports are `emulated:laser`, `gate`, `scanner` and `spad`."""
+    """Config of the world with emulated devices. Their ports are `emulated:laser`, `emulated:gate`, `emulated:scanner`
+    and `emulated:spad`."""
 
     real_time: ClassVar[bool] = True
 
@@ -172,7 +173,7 @@ class EmulatedWorld(SimulatedWorld):
         self._frames.close()
 
     def photon_source(self, times: FrameTimes) -> PhotonSource:
-        """A source of frames with this timing."""
+        """A source of frames with this timing; the caller closes it."""
         return self.photons(times, self._seed, min(MAX_THREADS, cores()))
 
     def _draw_once(self) -> None:
@@ -187,7 +188,7 @@ class EmulatedWorld(SimulatedWorld):
         """State of the rig during frames that start at start_s (n,), ascending, one period apart, and the laser power
         in W (n,) that an open gate lets out in the middle of each exposure.
 
-        Times are the host's. The state's own power_w is that of the first frame.
+        Times are the host's. The state's own power_w is that of the first frame, and its velocity is unknown (NaN).
         """
         middle, until_s = start_s + 0.5 * exposure_s, float(start_s[-1]) + period_s
         history, lag = self.scanner.history, self.model.lag_s
@@ -241,7 +242,8 @@ class EmulatedWorld(SimulatedWorld):
 
 
 class WorldFrames:
-    """Frames of the simulated world for the emulated SPAD: a `FrameSource` of SPB1 boards, `whole` for the SPAD512S."""
+    """Frames of the simulated world for the emulated SPAD: as a `FrameSource` for SPB1 boards, and from `whole` for the
+    SPAD512S."""
 
     def __init__(self, world: EmulatedWorld, clock: Clock) -> None:
         self._world = world
@@ -271,7 +273,8 @@ class WorldFrames:
 
     def whole(self, first_frame: int, start_s: float, period_s: float, n: int) -> NDArray[np.uint8]:
         """n full frames as the camera sees them, uint8 (n, height, row bytes), exposed for their whole period. start_s:
-        start of the first, host's time. Their records are dropped, since the SPAD512S sends pixels only."""
+        start of the first one, in the host's time. The frames' records are dropped, since the SPAD512S sends pixels
+        only."""
         rows, width = self._world.size
         bits = np.zeros((n, rows, packed_row_bytes(width)), np.uint8)
         self.expose(Span(first_frame, n, start_s, period_s, period_s, None), np.zeros(n, FRAME_RECORD), bits)

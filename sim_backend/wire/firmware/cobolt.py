@@ -92,9 +92,9 @@ _POWERS: dict[Family, dict[str, tuple[str, float]]] = {
 class CoboltModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change. refuses: commands and questions that this
-    unit does not know; None: those of its family. shutter: whether it knows `l0r` and `l1r`, which pause and resume;
-    None: as its family. key_cycle: whether `@cob1` waits in any state until the key is turned off and on again.
+    on_emission(emits, now_s) is called when `emitting` or `power_w` has changed. refuses: commands and questions that
+    this unit does not know; None: those of its family. shutter: whether it knows `l0r` and `l1r`, which pause and
+    resume; None: as its family. key_cycle: whether `@cob1` waits in any state until the key is turned off and on again.
     deaf_s: time from the start of the warm-up for which it answers OK to a command for a power, but does not obey.
     """
 
@@ -173,14 +173,14 @@ class CoboltModel:
         return self.power_w > 0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.on = True
         self.mode = "modulation" if gated else "constant power"
         self.digital = gated
         self.modulation_power_w = self.constant_power_w = power_w
 
     def turn_key(self, on: bool, now_s: float) -> None:
-        """Turn the key on or off by hand."""
+        """Turn the key on or off by hand. Off stops the laser; on starts the warm-up if the laser waits for the key."""
         self.key_on = on
         if not on:
             self._stop()

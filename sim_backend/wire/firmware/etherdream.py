@@ -61,7 +61,9 @@ class EtherDreamModel:
         mac: bytes = b"\x00\x04\xa3\x87\x28\xcd",
         build: str = "v0.5.5",
     ) -> None:
-        """axis: the one whose mirror the history follows. clock_error: of its crystal. build: text of its version."""
+        """axis: the one whose mirror the history follows. clock_error: relative error of its crystal, positive if it
+        runs fast. extra_ticks, by_page: see the module. capacity: most points in the ring. build: text of its version.
+        """
         self.history = DacHistory(CENTRE, lines=4)
         self.deaf = False
         """Test knob: whether the firmware hears and says nothing, while its outputs play on."""
@@ -100,7 +102,7 @@ class EtherDreamModel:
 
     @property
     def fullness(self) -> int:
-        """Number of points in the ring. A stop leaves them there until the next p."""
+        """Number of points in the ring. A stop leaves them there until the next command p."""
         return len(self._ring)
 
     def connected(self, now_s: float) -> None:
@@ -145,9 +147,8 @@ class EtherDreamModel:
 
     def advance(self, now_s: float) -> None:
         """Play on until now. Each period of the timer shows the point that was read out before it, and reads out the
-        next one, whose rate change comes into force with the period that shows it. If there is no next one, all outputs
-        go to 0 V at once, and the point read out last is never shown.
-        """
+        next one. If that one changes the rate, the new rate holds from the period that shows it. If there is no next
+        one, all outputs go to 0 V at once, and the point read out last is never shown."""
         while self.playback == PLAYING and self._next_s <= now_s:
             if not len(self._ring):
                 self._stop(UNDERFLOW, self._next_s)
@@ -165,7 +166,8 @@ class EtherDreamModel:
                 self._set_rate(self.queued_rates.pop(0), self._next_s - period_s)
 
     def stop_input(self, active: bool, now_s: float) -> None:
-        """Open the interlock (active) or close it: a stop remains until c is sent."""
+        """Open the interlock (active) or close it. A stop remains until the command c is sent with the interlock
+        closed."""
         self.advance(now_s)
         if active:
             self._emergency_stop(BY_INPUT | INPUT_NOW, now_s)
@@ -295,9 +297,8 @@ class EtherDreamModel:
         return "a"
 
     def _begin(self, rate_hz: int, now_s: float) -> str:
-        """Begin to play. Acknowledged, and the rate is set, also if nothing was prepared; if the ring is empty, the
-        first period ends with an underflow.
-        """
+        """Begin to play. Acknowledged, and the rate is set, even if nothing was prepared; if the ring is empty, the
+        first period ends with an underflow."""
         if self._by_page and (self.playback != PREPARED or not self.fullness):
             return "I"
         self._set_rate(rate_hz, now_s)
@@ -308,7 +309,7 @@ class EtherDreamModel:
         return "a"
 
     def _queue_rate(self, rate_hz: int) -> str:
-        """Queue a rate for the next point that asks for one. Acknowledged also if it is dropped."""
+        """Queue a rate for the next point that asks for one. It is acknowledged even if it is dropped."""
         if self.playback != IDLE and len(self.queued_rates) < QUEUED_RATES:
             self.queued_rates.append(rate_hz)
             return "a"

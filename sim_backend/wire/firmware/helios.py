@@ -30,7 +30,7 @@ KEEP_S = 20.0
 class Played:
     """Points played from start_s on, one every period_s, cut off at end_s. The first one lasts longer by longer_s.
 
-    command: float64 (n,), normalised drive. levels: uint8 (n, lines), colour outputs.
+    command: float64 (n,), normalised drive, -1 to 1. levels: uint8 (n, lines), colour outputs.
     """
 
     start_s: float
@@ -262,7 +262,8 @@ class HeliosModel(DacModel):
     """The firmware. `history` also covers future times, as far as the buffers reach."""
 
     def __init__(self, *, name: str = "Helios 1", version: int = 6, clock_error: float = 0.0, axis: str = "x") -> None:
-        """clock_error: of its crystal. axis: the one whose mirror the history follows."""
+        """clock_error: relative error of its crystal, positive if it runs fast. axis: the one whose mirror the history
+        follows."""
         super().__init__(_SPEC, commands=COMMANDS, replies=REPLIES, points=FRAMES)
         self.shutter = False
         self.bootloader = False
@@ -284,9 +285,9 @@ class HeliosModel(DacModel):
         self._alternate = 0
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. To leave it, even for itself,
-        does what STOP does: colours low, and the mirror at the centre 100 ms later. Transfers that are under way end.
-        """
+        """Alternate 1 enables the DAC: colours low, and the mirror stays where it is. To leave it, or to choose it
+        again, does what STOP does: colours low, and the mirror at the centre 100 ms later. Transfers that are under way
+        end."""
         self.advance(now_s)
         if self._alternate == 1:
             self._stop(now_s)

@@ -8,9 +8,10 @@ again, `disable ext` lets channel 2 shine, channel 2 cannot be switched while `e
 too, `%SYS-I` lines are no errors, `talk quiet` swallows answers, and replies can fall one behind.
 
 The manual is not public. Made up here: numbers and texts of errors and of the lines of `talk gabby`, the text after a
-start, tables beyond the lines that clients look for, that an open interlock or key switches off and refuses `laser on`,
-that a power beyond the largest is refused, that the channels' sum stops at the largest power, and that echo, prompt and
-talk are forgotten without power. FINE is only stored. The service level (`power mode cw`) is not modelled.
+start, tables beyond the lines that clients look for, that an open interlock or a key turned off darkens the laser and
+makes it refuse `laser on`, that a power beyond the largest is refused, that the channels' sum stops at the largest
+power, and that echo, prompt and talk are forgotten without power. FINE is only stored. Not modelled: the service level
+(`power mode cw`).
 """
 
 import re
@@ -121,7 +122,7 @@ class IbeamModel:
         return self._level_w(NORMAL) if self.gated else self.power_w
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.state_on, self._lit_at_s = True, float("-inf")
         self.enabled, self.ext = {BIAS, NORMAL}, gated
         self.powers_w = {BIAS: 0.0, NORMAL: power_w}
@@ -137,7 +138,7 @@ class IbeamModel:
         self._tell()
 
     def set_fault(self, text: str, now_s: float) -> None:
-        """Let a fatal fault switch the laser off, for as long as `fault` holds its text."""
+        """Let a fatal fault switch the laser off. It cannot be switched on as long as `fault` holds a text."""
         self._now_s, self.fault, self.state_on = now_s, text, False
         self._tell()
 

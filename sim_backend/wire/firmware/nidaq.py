@@ -15,13 +15,13 @@ What drivers trip over:
 - Rates are 100 MHz divided by an integer: for 48 kHz it is 48007.68 Hz. The crystal has an error of its own.
 - Two tasks cannot have the same output, nor can two have the clock of the analogue outputs.
 
-Public sources do not tell the following, so it is assumed. A finite task is done half a period after its last
-sample. A stop drops samples that are not regenerated. A write to a task that waits for its trigger replaces samples
-that the card's memory already holds. A counter's first pulse begins with the edge number `initial_delay` of its
-clock after the start. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand
-write with automatic start releases the output afterwards. Analogue outputs with and without a clock exclude each other,
-as on a PXI-6723. Lines that are taken are -200587, all else that is taken -50103. Full scale is exactly 10 V in 32767
-steps.
+Public sources do not tell the following, so it is assumed. A finite task is done half a period after its last sample. A
+stop drops samples that are not regenerated. A write to a task that waits for its trigger replaces samples that the
+card's memory already holds. A counter's first pulse begins with the edge number `initial_delay` of its clock after the
+start. A reset is reported as -88709, once, by the next call about a task that ran. An on-demand write with automatic
+start releases the output afterwards. Analogue outputs with and without a clock exclude each other, as on a PXI-6723. A
+task that needs lines of another task is refused with -200587, one that needs anything else of another task with -50103.
+Full scale is exactly 10 V in 32767 steps.
 """
 
 import re
@@ -72,9 +72,8 @@ class NidaqModel(Card):
     """The card and its driver."""
 
     def __init__(self, *, markers: Mapping[int, str] = MARKERS, clock_error: float = 0.0) -> None:
-        """markers: outputs, such as `port0/line0` or `ctr0`, by their line in `history`. clock_error: of the crystal,
-        relative.
-        """
+        """markers: outputs, such as `port0/line0` or `ctr0`, by their line in `history`. clock_error: relative error of
+        the crystal, positive if it runs fast."""
         super().__init__(clock_error)
         self.history = CardHistory(self.outputs["ao0"], {line: self.outputs[name] for line, name in markers.items()})
         self.exported: dict[str, str] = {}

@@ -3,8 +3,9 @@
 Each fact has its public source in the table of docs/reference/devices/obis.md. Commands end with CR or LF, replies with
 CRLF; words may be written short (`SYST`) or long (`SYSTem`). The model has the traps of the real laser: set commands
 get no answer with the handshake off, ON during warm-up is deferred, emission follows ON by the CDRH delay, mode changes
-are refused while the laser is on (ERR-200), no status word has the bit 'ready', without its key it says that the
-interlock is open, behind a Remote only numbered commands reach it, and without a Remote none of them does.
+are refused while the laser is on (ERR-200), no status word has the bit 'ready' (unless `words` is "ready"), without its
+key it says that the interlock is open, behind a Remote only numbered commands reach it, and without a Remote none of
+them does.
 """
 
 import re
@@ -62,11 +63,11 @@ _SETTINGS = ("SOUR:POW:LEV:IMM:AMPL", "SOUR:AM:INT", "SOUR:AM:EXT", "SOUR:AM:STA
 class ObisModel:
     """The laser. Its attributes are the truth, for tests to look at; the driver sees only the replies.
 
-    on_emission(emits, now_s) is called whenever power or emission change. channel: the laser's slot, if it is on a
-    Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits 0x1080
-    set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched on, as
-    the manual's table has it. emission_bit_lag_s: time for which the status still says 'emission' after the laser was
-    switched off.
+    on_emission(emits, now_s) is called when `emitting` or `power_w` has changed. channel: the laser's slot, if it is on
+    a Remote. words: "plain" units say C8000008 when idle and 00000000 without a fault; "marked" ones have the bits
+    0x1080 set in the status and say 80000000 without a fault; "ready" ones set the bit 0x4 when they could be switched
+    on, as the manual's table has it. emission_bit_lag_s: time for which the status still says 'emission' after the
+    laser was switched off.
     """
 
     handshake: bool = True
@@ -130,7 +131,7 @@ class ObisModel:
         return self.set_power_w if self.emitting else 0.0
 
     def shine(self, power_w: float, *, gated: bool = True) -> None:
-        """Switch the laser on, as an earlier user may have left it."""
+        """Switch the laser on, as an earlier user may have left it. `on_emission` is called at the next `tick`."""
         self.state_on = True
         self._warm_at_s = self._lit_at_s = float("-inf")
         self.mode = "DIGITAL" if gated else "CWP"

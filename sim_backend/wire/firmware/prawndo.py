@@ -160,7 +160,8 @@ class PrawnDoModel(OutputLevels):
         self._unasked = BANNER
 
     def set_external_clock(self, hz: int | None, at_s: float) -> None:
-        """Change the frequency on GPIO20, or take the clock away (None)."""
+        """Change the frequency on GPIO20, or take the clock away (None). If the board uses the clock when it is taken
+        away, it goes on with its own one."""
         self._settle(at_s)
         if not self.clock_external:
             self.external_clock_hz = hz

@@ -6,15 +6,15 @@ is padded to a multiple of 8 ns. Outputs lag an edge by 61 to 69 ns. With manual
 `rearm`. Since firmware 1.1, the `pulsestreamer` package uploads sequences over a TCP port of their own. Before, they
 are base64 text of big-endian numbers, which package 2.1 packs in the wrong order.
 
-Public sources do not say the following, and the model chose. A new sequence that waits for its trigger finds the
-outputs as they are, be it in the middle of the old one. Padding repeats the last level. After its last run the device
-is ready for a trigger `rearm_s` later. `constant` and `forceFinal` drop the sequence, unless `keeps_sequence`; the
-package takes it for dropped. `startNow` starts nothing in a hardware mode or while a sequence plays, and is answered
-with 0 all the same. `rearm` answers 0 where there is nothing to rearm. Steps of 0 ns (breakpoints too) are left out,
-and a sequence of nothing else lasts 8 ns. 0 runs are refused. A binary upload that is refused gets the code 1.
-`setTrigger` acts at once, but never starts a sequence. What software starts begins at once. Not modelled: analog
-outputs, underflow, the square wave of 125 MHz, calibration, the network's settings, and the double buffer of
-firmware 2 (`start`, `upload`). Calls of these are unknown to the model.
+Public sources do not say the following, so it is assumed. While a new sequence waits for its trigger, the outputs stay
+as they are, even in the middle of the old one. Padding repeats the last level. After its last run the device is ready
+for a trigger `rearm_s` later. `constant` and `forceFinal` drop the sequence, unless `keeps_sequence`; the package takes
+it for dropped. `startNow` starts nothing in a hardware mode or while a sequence plays, and is answered with 0 all the
+same. `rearm` answers 0 where there is nothing to rearm. Steps of 0 ns (breakpoints too) are left out, and a sequence of
+nothing else lasts 8 ns. 0 runs are refused. A binary upload that is refused gets the code 1. `setTrigger` acts at once,
+but never starts a sequence. What software starts begins at once. Not modelled: analog outputs, underflow, the square
+wave of 125 MHz, calibration, the network's settings, and the double buffer of firmware 2 (`start`, `upload`). Calls of
+these are unknown to the model.
 """
 
 import base64
@@ -88,7 +88,7 @@ class Program:
 
     @property
     def duration_s(self) -> float:
-        """Duration of all runs."""
+        """Duration of all runs; infinite if they have no end."""
         return self.n_runs * self.length_ns * _NS if self.n_runs > 0 else math.inf
 
 
@@ -261,7 +261,7 @@ class PulseStreamerModel:
     # What happens to the device
 
     def power_cycle(self, at_s: float) -> None:
-        """Switch the power off and on."""
+        """Switch the power off and on. The sequence is lost, and the outputs are low."""
         self.advance(at_s)
         self._reset()
 

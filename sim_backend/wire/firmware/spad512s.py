@@ -96,7 +96,7 @@ class Spad512sModel:
         self._run: _Run | None = None
 
     def connected(self, now_s: float) -> None:
-        """Greet the client."""
+        """Greet the client. No run goes on from an earlier client."""
         self._out = bytearray(self._program.banner.encode())
         self._run = None
 

@@ -33,7 +33,8 @@ FT601_COMMAND: Final = struct.Struct("<IBBHIII")
 
 
 class SpbUsbModel(UsbModel):
-    """The device. mangle: returns the pieces to send in place of a block, so that tests can damage the stream."""
+    """The device. mangle: a function from a block to the pieces that are sent in its place, so that tests can damage
+    the stream; None: blocks are sent as they are."""
 
     def __init__(self, source: FrameSource, board: SpbUsbBoard) -> None:
         self.chip: Chip = board.chip
@@ -59,7 +60,7 @@ class SpbUsbModel(UsbModel):
     # The bus
 
     def unplugged(self, now_s: float) -> None:
-        """Note that the bus power is gone."""
+        """Note that the bus power is gone: the run is lost, the registers are as at power-up, and the gate is low."""
         self._reset()
 
     def halt_cleared(self, endpoint: int, now_s: float) -> None:

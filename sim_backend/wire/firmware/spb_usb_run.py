@@ -299,9 +299,8 @@ _FT601_CONFIG = struct.Struct("<HH128sBBHBBBBHBBII")
 
 
 def ft601_config(board: SpbUsbBoard) -> bytes:
-    """The FT601's configuration, 152 bytes, as FT_60XCONFIGURATION in ftd3xx.h has it. One channel: FT245 mode, two:
-    FT600 mode.
-    """
+    """The FT601's configuration, 152 bytes, as FT_60XCONFIGURATION in ftd3xx.h has it. With one channel its mode is
+    FT245, with two FT600."""
     strings = ("FTDI", board.product_name, board.serial or "")
     texts = b"".join(bytes((2 + 2 * len(text), 3)) + text.encode("utf-16-le") for text in strings)
     two = board.acks == "endpoint"

@@ -39,8 +39,8 @@ Marker = Callable[[float, float], float | None]
 class TeensyModel(OutputLevels):
     """The firmware and the pins. Times are seconds of whatever clock the wire runs on; they never decrease.
 
-    trigger, marker_low: when the scan marker is high, and when it is low. Without trigger it is always low; without
-    marker_low its fall is found out from trigger, to `POLL_S`. serial: the board's serial number.
+    trigger, marker_low: functions that tell when the scan marker is high, and when it is low. Without trigger it is
+    always low; without marker_low its fall is found out from trigger, to `POLL_S`. serial: the board's serial number.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class TeensyModel(OutputLevels):
         self._set_outputs(0, at_s)
 
     def close_port(self, at_s: float) -> None:
-        """Let DTR fall, as when the host's process ends; the same happens if USB is suspended."""
+        """Let DTR fall, as when the host's process ends or USB is suspended. The program is aborted and dropped."""
         self.advance(at_s)
         self.dtr, self.load = False, "empty"
         if self.state == "playing":

@@ -38,7 +38,7 @@ class GrpcModel(Protocol):
         """Note that a call came."""
 
     def call(self, call: Call, now_s: float) -> dict[str, Any] | None:
-        """Fields of the answer to a call; None: not yet. Raises `DaqmxError`."""
+        """Fields of the answer to a call; None: not yet, the same call comes again later. Raises `DaqmxError`."""
 
     def advance(self, now_s: float) -> None:
         """Let time pass."""
@@ -62,7 +62,7 @@ class GrpcServer(WireServer[GrpcModel]):
         return f"{HOST}:{self._port}"
 
     def plug(self) -> None:
-        """Listen, on the same port as before."""
+        """Listen: on any free port the first time, later on the same one."""
         if self._server is not None:
             return
         self._workers = ThreadPoolExecutor(WORKERS, "GrpcServer")

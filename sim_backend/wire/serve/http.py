@@ -148,7 +148,8 @@ class HttpServer(WireServer[RpcModel]):
         return _said(ident, result=result) if "id" in request else b""
 
     def take(self, client: socket.socket, data: bytearray) -> bytes | None:
-        """The answers to bytes of the other port; None: the connection is lost."""
+        """Take complete messages away from the front of `data`, which came to the port that takes bytes. Returns the
+        answers; None: the connection is lost."""
         if not self._awake(client):
             return None
         with self.lock:

@@ -1,8 +1,8 @@
 """A serial line to a model of a device, on a pseudo terminal.
 
-Replies leave at 10 bits a character, as through a UART (a virtual COM port is faster, and no driver may depend on
-that). The terminal is opened by the real pyserial, from any process, and runs in the host's time; it ignores the host's
-baud rate. Its path is a link that exists while the device is plugged in, and is the same when it is plugged in again.
+Replies leave at 10 bits a character, as through a UART of the server's baud rate. (A virtual COM port is faster.) The
+terminal is opened by the real pyserial, from any process, and runs in the host's time; the baud rate that the host sets
+is ignored. Its path is a link that exists while the device is plugged in, and is the same when it is plugged in again.
 """
 
 import os
@@ -61,7 +61,7 @@ class SerialServer(WireServer[SerialModel]):
         self._folder.cleanup()
 
     def plug(self) -> None:
-        """Plug the cable in."""
+        """Plug the cable in. Raises DeviceError on Windows, which has no pseudo terminals."""
         with self.lock:
             if self._master is not None:
                 return

@@ -52,7 +52,7 @@ class TcpServer(WireServer[TcpModel]):
         return f"{HOST}:{self._port}"
 
     def plug(self) -> None:
-        """Start the program, which listens on the same port as before."""
+        """Start the program. It listens on any free port the first time, later on the same one."""
         with self.lock:
             if self._listener is None and self._client is None:
                 self._listen()

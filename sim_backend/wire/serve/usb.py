@@ -60,7 +60,11 @@ class _Handle:
 
 
 class EmulatedUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb carries no types
-    """A bus. `plug` may be called at any time from any thread. Waiting uses the clock that is passed in."""
+    """A bus. `plug` may be called at any time from any thread. Waiting uses the clock that is passed in.
+
+    A transfer returns the number of bytes that passed. It raises USBTimeoutError if its timeout ended before any did,
+    and ValueError for a timeout of 0 ms.
+    """
 
     def __init__(self, clock: Clock) -> None:
         super().__init__()

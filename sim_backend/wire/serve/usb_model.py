@@ -153,16 +153,15 @@ class Setup:
 
 
 class UsbModel:
-    """Base of device models, which refuses every transfer. Times are seconds of the transport's clock and never
-    decrease.
-    """
+    """Base of device models. By itself it refuses every transfer. Times are seconds of the transport's clock and never
+    decrease."""
 
     spec: DeviceSpec
     gone: bool = False
     """Whether the device cut its own connection: the transport unplugs it at the next call."""
 
     def set_interface(self, interface: int, alternate: int, now_s: float) -> None:
-        """Note that the host chose an alternate setting. It is 0 also when the host released the interface or died."""
+        """Note that the host chose an alternate setting. It returns to 0 if the host releases the interface or dies."""
 
     def halt_cleared(self, endpoint: int, now_s: float) -> None:
         """Note that the host cleared a halt, which it may do without any halt before (USB 2.0, 9.4.5)."""
@@ -247,7 +246,7 @@ class AttachedDevice:
             self.model.configured(self._now())
 
     def reset(self) -> None:
-        """Reset the port: the host then chooses the configuration again. libusb claims its interfaces again."""
+        """Reset the port: the host then chooses the configuration again. Claims stay, since libusb renews them."""
         with self._alive():
             self.configuration = 1
             self._alternates.clear()

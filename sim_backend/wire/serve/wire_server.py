@@ -15,8 +15,8 @@ Model = TypeVar("Model")
 class WireServer(ABC, Generic[Model]):
     """A device on its own wire, served by a thread from entering the `with` block (or `start`) to leaving it (`close`).
 
-    The model's time comes from a clock, so that a warm-up of minutes costs a test nothing. Replies travel in the host's
-    time.
+    The model's time comes from a clock, so that a warm-up of minutes costs a test with a virtual clock nothing. Replies
+    travel in the host's time.
     """
 
     def __init__(self, model: Model, clock: Clock | None) -> None:
@@ -69,7 +69,8 @@ class WireServer(ABC, Generic[Model]):
         """Pull the cable. The open port is lost, and so are bytes on their way."""
 
     def hang(self) -> None:
-        """Let the firmware hang: it takes and sends nothing. What its outputs are doing goes on."""
+        """Let the firmware hang: it takes and sends nothing, and queued replies are lost. What its outputs are doing
+        goes on."""
         with self.lock:
             self._hung = True
             self._outbox.clear()

@@ -24,7 +24,7 @@ class Card:
     name: Final = "Dev1"
 
     def __init__(self, clock_error: float) -> None:
-        """clock_error: of the crystal, relative."""
+        """clock_error: relative error of the crystal, positive if it runs fast."""
         counts = {"ao": ni.AO_CHANNELS, "port0/line": ni.LINES, "ctr": ni.COUNTERS}
         self.outputs = {f"{kind}{n}": Output() for kind, count in counts.items() for n in range(count)}
         self.tasks: dict[str, DaqTask] = {}
@@ -32,7 +32,7 @@ class Card:
         self._outside: dict[str, Edges] = {}
 
     def advance(self, now_s: float) -> None:
-        """Let everything end that ends by itself until now, in order."""
+        """End everything that ends by itself until now, in order of time, and forget what is older than `KEEP_S`."""
         while True:
             task = min(self.tasks.values(), key=DaqTask.ends_s, default=None)
             if task is None or (ends_s := task.ends_s()) > now_s:
@@ -60,7 +60,7 @@ class Card:
         self._follow(terminal, now_s)
 
     def reset(self, now_s: float) -> None:
-        """Reset the device: abort all tasks. Analogue outputs go to 0 V, lines to their level after power-up."""
+        """Reset the device: abort all tasks. Analogue outputs go to 0 V, all others low."""
         for task in self.tasks.values():
             task.error = DaqmxError(-88709) if task.state == ni.RUNNING else task.error
             self.stop(task, now_s, ni.VERIFIED)
@@ -70,7 +70,7 @@ class Card:
     # Names and rates
 
     def terminal(self, text: str, code: int = -89120) -> str:
-        """A terminal's name without the card's. Raises DaqmxError with this code if there is no such terminal."""
+        """Name of a terminal without that of the card. Raises DaqmxError with `code` if there is no such terminal."""
         local = text.removeprefix("/").removeprefix(f"{self.name}/").lower()
         found = [known for known in (*_PINS, *_CLOCKS, *_TRIGGERS) if known.lower() == local]
         if not found:
@@ -78,7 +78,8 @@ class Card:
         return found[0]
 
     def source(self, task: DaqTask) -> str:
-        """Terminal of the clock that a task counts; "" is the card's own clock."""
+        """Terminal of the clock that a task counts; "" is the card's own clock. Raises DaqmxError for one that it
+        cannot count."""
         if task.source.lower() in ("", "onboardclock"):
             return ""
         known = self.terminal(task.source)
@@ -87,7 +88,7 @@ class Card:
         return known
 
     def physical(self, text: str, kind: str) -> list[str]:
-        """The outputs in a list of physical channels of a kind: ao, port or ctr."""
+        """The outputs in a list of physical channels of a kind: ao, port or ctr. Raises DaqmxError for others."""
         found: list[str] = []
         for one in expand(text):
             device, _, local = one.removeprefix("/").lower().partition("/")
@@ -102,7 +103,7 @@ class Card:
         return found
 
     def check_device(self, name: str) -> None:
-        """Refuse a device that does not exist."""
+        """Raise DaqmxError for a device that does not exist."""
         if name.lower() != self.name.lower():
             raise DaqmxError(-200220, f"Device: {name}")
 
@@ -143,7 +144,8 @@ class Card:
         task.state = max(task.state, ni.VERIFIED)
 
     def commit(self, task: DaqTask) -> None:
-        """Bring a task to the state committed, with all its resources."""
+        """Bring a task to the state committed, with all its resources. Raises DaqmxError if the task is wrong, or if
+        another task has one of the resources."""
         self.verify(task)
         if task.state >= ni.COMMITTED:
             return
@@ -161,7 +163,8 @@ class Card:
         task.state = ni.COMMITTED
 
     def start(self, task: DaqTask, now_s: float, before: int) -> None:
-        """Start a task, unless it runs. before: the state to which a stop brings it back."""
+        """Start a task, unless it runs; it may then wait for its trigger. before: the state to which a stop brings it
+        back. Raises DaqmxError if it cannot start."""
         if task.state == ni.RUNNING:
             return
         self.commit(task)
@@ -233,7 +236,8 @@ class Card:
                 self._pause(other, at_s)
 
     def lay(self, task: DaqTask, sample: int) -> None:
-        """Give the outputs of a task with a clock its samples from a number on, in place of what was to come there."""
+        """Give the outputs of a task with a clock its samples from number `sample` on, in place of what was to come
+        then."""
         assert task.edges is not None, "asked for by the caller"
         if task.kind == "co":
             delay, high, low = task.pulse

@@ -40,7 +40,7 @@ class Edges:
         return self.first_s + index * self.period_s
 
     def from_(self, time_s: float) -> "Edges":
-        """The edges at a time and after."""
+        """The edges from a time on."""
         passed = max(0, math.ceil((time_s - self.first_s) / self.period_s - EARLY))
         return Edges(self.at(passed), self.period_s)
 
@@ -98,7 +98,7 @@ class Output:
             self._spans.append(span)
 
     def put(self, value: float, time_s: float) -> None:
-        """Go to a value, and hold it."""
+        """Go to a value at a time, and hold it."""
         self.play(Samples(Edges(time_s, 1e-9), 1, np.array([value])))
 
     def cut(self, time_s: float) -> None:
@@ -115,14 +115,15 @@ class Output:
                     self._spans[-1] = replace(last, count=kept)
 
     def forget(self, before_s: float) -> None:
-        """Forget what had ended before a time."""
+        """Forget the spans that had ended before a time. At their times the output then reads as the last value of the
+        last one."""
         with self._lock:
             while len(self._spans) > 1 and self._spans[1].edges.first_s <= before_s:
                 gone = self._spans.popleft()
                 self._rest = float(gone.values(np.array([self._spans[0].edges.first_s]))[0])
 
     def values(self, time_s: Array) -> Array:
-        """Values at times."""
+        """Values of the output at times, float64 of the same shape."""
         with self._lock:
             spans = list(self._spans)
         at = np.searchsorted(np.array([one.edges.first_s for one in spans]), time_s, side="right") - 1

@@ -125,7 +125,7 @@ class DaqTask:
 
     @property
     def full_v(self) -> float:
-        """Range of the converter for these limits."""
+        """Range of the converter for these limits, in V; the larger limit if no range covers them."""
         needed = max(map(abs, self.limits_v))
         return next(one for one in (*RANGES_V, needed) if one >= needed)
 
@@ -141,7 +141,7 @@ class DaqTask:
 
     @property
     def limit(self) -> float:
-        """Samples, or pulses of a counter, to generate."""
+        """Number of samples, or of pulses of a counter, to generate; infinite if the task is continuous."""
         return np.inf if self.continuous else self.samples if self.clocked else 1
 
     @property
