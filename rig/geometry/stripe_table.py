@@ -42,7 +42,7 @@ class StripeTable:
     def problem(self, rows: int, columns: int) -> str | None:
         """The first fault of a table that another package has made, in words; None if there is none.
 
-        A fault is an array that is not float32 of shape (rows, columns), or a value of `confidence` outside 0 to 1.
+        A fault is an array that is not float32 of shape (rows, columns), or a confidence outside 0 to 1.
         """
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         for name, value in values.items():
@@ -51,9 +51,9 @@ class StripeTable:
             kind, shape = getattr(value, "dtype", type(value).__name__), getattr(value, "shape", ())
             if kind != np.float32 or shape != (rows, columns):
                 return f"{name} as {kind} {shape}, which must be float32 ({rows}, {columns})"
-        outside = ~((self.confidence >= 0) & (self.confidence <= 1))
-        if outside.any():
-            return f"a confidence of {float(self.confidence[outside][0]):g}, which must be from 0 to 1"
+        for confidence in (self.confidence, self.confidence2):
+            if confidence is not None and (outside := ~((confidence >= 0) & (confidence <= 1))).any():
+                return f"a confidence of {float(confidence[outside][0]):g}, which must be from 0 to 1"
         return None
 
     @classmethod

@@ -111,8 +111,8 @@ class LineScan:
         frames = budget.frames(apparatus.spad_frame_s)
         dark = max(1, math.ceil(MIN_DARK_FRACTION * frames))
         across = geometry.columns // self.lines
-        if frames - dark < min(LEAST_PLACES, across):
-            raise TooShort(f"{self.name} needs {(LEAST_PLACES + 2) * apparatus.spad_frame_s * 1e3:.3g} ms")
+        if frames - dark < (least := min(LEAST_PLACES, across)):
+            raise TooShort(f"{self.name} needs {(least + 2) * apparatus.spad_frame_s * 1e3:.3g} ms")
         one = places_of(np.arange(across, dtype=np.float64), frames - dark)
         step = geometry.commands[1] - geometry.commands[0]
         commands = np.concatenate(
@@ -180,8 +180,8 @@ class LineCamera:
         """Measure once (see `Strategy`), with as many places of the line as images can be taken in the time, but at
         most one for each column."""
         most = budget.frames(apparatus.camera_frame_s)
-        if most < LEAST_PLACES:
-            raise TooShort(f"{self.name} needs {LEAST_PLACES * apparatus.camera_frame_s * 1e3:.3g} ms")
+        if most < (least := min(LEAST_PLACES, geometry.columns)):
+            raise TooShort(f"{self.name} needs {least * apparatus.camera_frame_s * 1e3:.3g} ms")
         number = min(geometry.columns, most)
         stands = np.rint((np.arange(number) + 0.5) * (geometry.columns / number) - 0.5).astype(np.int64)
         sweep = geometry.sweep(geometry.commands[stands])

@@ -31,7 +31,7 @@ class ConventionalCamera(Section):
     read_noise: float = Field(default=6.8, ge=0, le=1000)
     """Standard deviation of a read-out, in electrons."""
     full_well: float = Field(default=32700, ge=10, le=1e7)
-    """Electrons at which a pixel is full, and at which the converter reads its largest value."""
+    """Electrons at which a pixel is full. The converter's largest value lies above it by the black level."""
     dark_current: Annotated[CountsPerSecond, Field(ge=0)] = 1.5
     """Electrons per second in the dark."""
     bits: int = Field(default=12, ge=8, le=16)
