@@ -3,7 +3,7 @@
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
 waits for a call of `Pace.step` before each sweep, or, if there are no scan markers, before each block. Time lost to a
 full ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at
-once. A run, in this module, is what comes after one start of the SPAD.
+once. A run in this module is one start of the SPAD.
 """
 
 import math
@@ -95,7 +95,8 @@ class Pace:
         return not self._run_on
 
     def most_frames(self, period_s: Fraction) -> float:
-        """Most frames of a block, so that blocks come regularly also at a slow clock; infinite without a speed."""
+        """Most frames of a block, so that blocks come regularly even at a slow clock; infinite without a speed.
+        period_s: frame period as recorded."""
         return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:

@@ -66,7 +66,8 @@ Value = TypeVar("Value")
 
 
 def attached_cards() -> list[tuple[str, str]]:
-    """Name and model of each card that NI-DAQmx on this computer knows; none without the package or NI-DAQmx."""
+    """Name and model of each card that NI-DAQmx on this computer knows; an empty list without the package nidaqmx or
+    NI-DAQmx."""
     try:
         system, errors = import_module("nidaqmx.system"), import_module("nidaqmx.errors")
     except ImportError:
@@ -78,12 +79,14 @@ def attached_cards() -> list[tuple[str, str]]:
 
 
 class NiCard:
-    """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread."""
+    """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread. Methods that use
+    tasks raise nidaqmx's own errors: call them within `errors`."""
 
     def __init__(self, address: str) -> None:
         """Load nidaqmx, and connect to the server if the address, "Dev1" or "[grpc=]HOST:PORT/Dev1", names one.
 
-        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer, and as `errors`.
+        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer, and the errors
+        that `errors` makes of nidaqmx's.
         """
         server, _, self.device = address.removeprefix(GRPC_PREFIX).rpartition("/")
         self.name = f"nidaq {self.device}"
@@ -141,7 +144,7 @@ class NiCard:
 
     @contextmanager
     def task(self) -> Iterator[Any]:
-        """A new `nidaqmx.Task`, which is cleared at the end. That also ends what it does."""
+        """A new `nidaqmx.Task`, which is cleared at the end of the context. That also ends what the task does."""
         task = self.new_task()
         try:
             yield task
@@ -149,8 +152,8 @@ class NiCard:
             self._clear(task)
 
     def clear(self, keep: int = 0) -> None:
-        """Clear all but the `keep` oldest tasks, latest first; then raise the last error. An interrupt leaves the
-        rest."""
+        """Clear all but the `keep` oldest tasks, latest first. If clearing some of them failed, raises the last error
+        afterwards. An interrupt (Ctrl-C) leaves the remaining tasks as they are."""
         failed: Exception | None = None
         while len(self._tasks) > keep:
             try:

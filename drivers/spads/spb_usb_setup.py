@@ -114,7 +114,7 @@ class RunSetup:
     window: WindowTable | None = None
 
     def write(self, control: ControlChannel) -> None:
-        """Write the registers."""
+        """Write the registers, and the window table if there is one."""
         control.write_all(
             (
                 (Register.HEARTBEAT_MS, round(self.heartbeat_s * 1000)),
@@ -138,7 +138,7 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """Make the run end after `n_frames` frames; None: only when it is told to end."""
+    """Make the run end after `n_frames` frames; None: the run ends only when the device is told so."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
@@ -167,7 +167,8 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped without a pattern."""
+    """Play the test pattern; raises `ProtocolError` if its bits or rows come in a wrong order. Does nothing if the
+    device has no test pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks
