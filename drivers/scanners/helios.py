@@ -96,7 +96,7 @@ def sendable(points: int) -> bool:
     """Whether the firmware completes a frame of that many points.
 
     A frame of 7 n + 5 bytes fills whole packets of 64 at n = 45, 109, 173 ... Then no short packet ends the transfer,
-    and the firmware waits forever (issue 6 of the vendor's repository).
+    and the firmware waits for ever (issue 6 of the vendor's repository).
     """
     return points % 64 != 45
 
