@@ -9,7 +9,7 @@ NS_PER_S = 1_000_000_000
 
 @runtime_checkable
 class Clock(Protocol):
-    """Monotonic time and waiting. It is passed in everywhere, so that tests of code that waits take no real time."""
+    """Monotonic time and waiting. Code that waits is given a clock, so that its tests take no real time."""
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary start; never decreases."""

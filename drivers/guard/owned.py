@@ -98,7 +98,8 @@ class GuardedDevice:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy in the application can tell without asking. May raise DeviceError."""
+        """Open the device; returns the properties that its proxy in the application can then tell without asking. May
+        raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):

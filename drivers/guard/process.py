@@ -372,7 +372,8 @@ OFF_TIMES = 2
 
 
 class Rescue:
-    """Makes gate and laser safe at the same time, each on its own thread."""
+    """Makes gate and laser safe from the application once the guard is gone: at the same time, each on its own
+    thread."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
         """Import the drivers now, since a rescue leaves no time for that. configs: by slot ("laser" or "sync"). ports:

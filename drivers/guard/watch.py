@@ -142,7 +142,7 @@ class WatchedProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended, as far as there is a pidfd to tell."""
+        """Whether the process has ended. Without a pidfd its end is not noticed."""
         if not self._ended and self.handle is not None:
             ready = select.poll()
             ready.register(self.handle, select.POLLIN)

@@ -1,4 +1,4 @@
-"""The last work on a device that nobody closed: when it is deleted, or Python ends."""
+"""The last work on a device that nobody closed. It is done when the device is deleted or Python ends."""
 
 import threading
 import weakref

@@ -22,7 +22,7 @@ class LaserLimits:
 
 @dataclass(frozen=True, slots=True)
 class LaserStatus:
-    """The laser's own report, read anew each time."""
+    """The laser's report on itself at the time when `status` was read."""
 
     emission: bool
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused, or while it warms up

@@ -65,7 +65,7 @@ class ScanWaveform:
 
 @dataclass(frozen=True, slots=True)
 class ScannerStatus:
-    """The scanner's own report, read anew each time."""
+    """The scanner's report on itself at the time when `status` was read."""
 
     moving: bool
     """A waveform is being played, or the mirror is on its way to rest."""

@@ -60,7 +60,7 @@ def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatus:
-    """The device's own report, read anew each time."""
+    """The device's report on itself at the time when `status` was read."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
     """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"."""

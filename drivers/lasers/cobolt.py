@@ -200,7 +200,7 @@ class CoboltLaser(SerialLaser):
     def __init__(
         self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool | None
     ) -> None:
-        """autostart: whether it is enabled; None: the laser does not say."""
+        """autostart: whether the laser's autostart is enabled; None: the laser does not say."""
         super().__init__(name, line, limits)
         self._dialect = dialect
         self._autostart = autostart

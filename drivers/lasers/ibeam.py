@@ -138,7 +138,8 @@ class IbeamConfig(SerialLaserConfig):
 
 
 class IbeamLaser(SerialLaser):
-    """An iBeam smart with pulse board. `arm` waits up to 10 s for it to come on, or until another thread pauses it."""
+    """An iBeam smart with a pulse board. `arm` waits at most 10 s for the laser to come on; a pause from another thread
+    ends the wait."""
 
     def __init__(self, line: Dialogue, framing: IbeamFraming, name: str, limits: LaserLimits) -> None:
         super().__init__(name, line, limits)

@@ -88,7 +88,8 @@ class ObisFraming:
 
     @property
     def ping(self) -> str:
-        """A query that is always answered: first whether the handshake is on, afterwards the laser's identity."""
+        """A query that is always answered: at first the query for the handshake, afterwards that for the laser's
+        identity."""
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:

@@ -179,7 +179,7 @@ class NiCard:
         return name if name.startswith("/") else f"/{self.device}/{name}"
 
     def property_of(self, ask: Callable[[], Value]) -> Value | None:
-        """The answer to a question about a property; None if this card does not have it."""
+        """The answer of `ask`, which reads a property; None if this card does not have that property."""
         try:
             return ask()
         except self._ni.DaqError as error:

@@ -118,7 +118,8 @@ class BlockReceiver:
         return self._judge(item, item.buffer[: reaped[1]])
 
     def drain(self, timeout_s: float) -> bool:
-        """Read on without publishing, for at most one wait of `timeout_s`. True once the last block has come."""
+        """Read one more block and drop it, waiting at most `timeout_s`; its frames count as exposed. Returns whether
+        the run's last block has come."""
         if not self._items:
             self._submit(self._spare(), slot=False)
         reaped = self._link.reap(timeout_s)
