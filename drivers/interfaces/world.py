@@ -30,8 +30,8 @@ class World(Protocol):
     ) -> SweepTruth:
         """The truth of one sweep.
 
-        commands: (columns,), the scanner command (normalised drive) at which each column was when the first image row
-        was exposed. velocity_per_s: speed of the command during the sweep, negative if it fell.
+        commands: (columns,), normalised drive of the scanner for each column when the first image row was exposed.
+        velocity_per_s: speed of the command during the sweep, negative if it fell.
         time_s: (columns,), seconds from the SPAD's last start until each column was exposed, ascending or descending,
           for worlds in which something moves. None: the time when the world was made.
         """

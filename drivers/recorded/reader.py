@@ -41,8 +41,8 @@ _log = logging.getLogger(__name__)
 class RecordedRun:
     """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: that of a sound block. It is
-    one of up to three sound blocks, and has the frame size and clock that most of these have.
+    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: the header of a sound block. Up
+    to three sound blocks are read; it is that of one with the frame size and clock that most of these have.
     """
 
     number: int

@@ -232,7 +232,8 @@ class ReplaySpadConfig(KindConfig):
 
 
 class ReplaySpad(SpadArray):
-    """Plays the starts of a recording one after the other; `configure` goes back to the first."""
+    """Plays the starts of a recording one after the other; `configure` goes back to the first. After the last one,
+    `start` raises `DeviceFault`, or begins again with the first if `loops` is true."""
 
     def __init__(self, config: ReplaySpadConfig, recording: RunRecording, clock: Clock) -> None:
         super().__init__(f"replay of {recording.path.name}")

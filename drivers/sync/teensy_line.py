@@ -49,7 +49,8 @@ class TeensyLine:
         self._heard = b""
 
     def connect(self) -> re.Match[str]:
-        """Take all outputs low, whatever an earlier host left behind; returns the answer to `id`, an `IDENTITY`.
+        """Take all outputs low, whatever an earlier host left behind; returns the match of `IDENTITY` with the answer
+        to `id`.
 
         Raises `ProtocolError` if something else answers, `DeviceTimeout` if nothing answers.
         """
@@ -72,7 +73,8 @@ class TeensyLine:
         return self.ask("id", IDENTITY, TRIES)
 
     def ask(self, command: str, form: re.Pattern[str], tries: int = 1) -> re.Match[str]:
-        """The answer to a command, without tag and checksum. tries: above 1 only for commands that may come twice.
+        """Send a command; returns the match of `form` with its answer, from which tag and checksum are removed. tries:
+        above 1 only for commands that may come twice.
 
         Raises `DeviceTimeout` if no answer comes, `CommandRefused` if it is an error, and `ProtocolError` if it is not
         of the `form`.
