@@ -20,7 +20,8 @@ SLOTS = ("spad", "scanner", "laser", "sync", "world")
 
 
 class KindConfig(BaseModel):
-    """Base of every kind's config. Unknown keys are refused and values cannot change. `kind` names the entry point."""
+    """Base of every kind's config. Unknown keys are refused, and values cannot be changed. `kind` names the entry
+    point."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 

@@ -38,11 +38,12 @@ class OnFull(Enum):
 
 
 class BlockRing:
-    """`slots` pieces of memory of `stride` bytes each, all allocated, and each page written once, on creation.
+    """Memory for `slots` blocks of `stride` bytes each. On creation all of it is allocated, and each page is written
+    once.
 
     One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
-    thread. holds_s: seconds of the stream that the ring can hold, for the message of an overflow; None if unknown.
-    Raises ValueError if `slots` or `stride` is below 1.
+    thread. on_full: fate of a block for which there is no free slot. holds_s: seconds of the stream that the ring can
+    hold, for the message of an overflow; None if unknown. Raises ValueError if `slots` or `stride` is below 1.
     """
 
     def __init__(self, slots: int, stride: int, *, on_full: OnFull = OnFull.WAIT, holds_s: float | None = None) -> None:

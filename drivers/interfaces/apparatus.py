@@ -23,8 +23,9 @@ class Spent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PulseTimes:
-    """Arrival times of first photons. counts: (rows, width, bins) uint32. A photon in bin i came between start_s + i
-    bin_s and start_s + (i + 1) bin_s seconds after its pulse left. pulses: number of pulses that each pixel got."""
+    """Arrival times of first photons. counts: (rows, width, bins) uint32. pulses: number of pulses that each pixel got.
+    A photon in bin i came between start_s + i bin_s and start_s + (i + 1) bin_s seconds after its pulse left.
+    """
 
     counts: NDArray[np.uint32]
     start_s: float

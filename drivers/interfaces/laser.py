@@ -58,8 +58,8 @@ class LineLaser(Device):
 
     @property
     def gate_only(self) -> bool:
-        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, as it is switched by
-        hand."""
+        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, since the laser is
+        switched by hand."""
         return False
 
     @property

@@ -114,7 +114,7 @@ class SerialLaser(SerialDevice, LineLaser):
         """Whether pause or disarm was called since arm began, which other threads may do."""
 
     def arm(self, power_w: float) -> None:
-        """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
+        """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended the arming."""
         self._stopped = False
         before, self._left.may_shine = self._left.may_shine, True
         try:

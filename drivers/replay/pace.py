@@ -133,8 +133,8 @@ class Pace:
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
-        """Note that a block due at `due_s` of recorded time was held up by a full ring for `waited_s`. As far as that
-        made the block late, it shifts all later ones."""
+        """Note that a block due at `due_s` of recorded time was held up by a full ring for `waited_s`. The part of that
+        time by which the block became late shifts all later blocks."""
         if self.speed is None:
             return
         late_ns = self._clock.now_ns() - self._due_ns(due_s, self.speed)

@@ -174,7 +174,8 @@ class EtherDreamLine:
         return reply
 
     def version(self) -> str:
-        """The firmware's name for itself. The oldest firmware does not know the command and closes the connection."""
+        """The firmware's name for itself. The oldest firmware does not know the command and closes the connection.
+        Raises as `ask`."""
         return printable(self._exchange(VERSION, _VERSION_BYTES).split(b"\0")[0].decode("ascii", "replace"))
 
     def close(self) -> None:

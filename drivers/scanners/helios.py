@@ -13,11 +13,11 @@ powered up or enabled, so STOP is sent when the board is opened. After that, STO
 end; a scan that is stopped ends with a brake ramp.
 
 The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
-the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
-ends. If its successor arrives after the earliest such time, the mirror may have stood still: the run ends with a fault.
-If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
-really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a
-time-out of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
+the pending frame began to play between the last status 'full' and the first 'free', and that bounds the time at which
+it ends. If the next frame arrives after the earliest possible end, the mirror may have stood still: the run ends with a
+fault. If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What
+was really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a time-out
+of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
 
 The first point of every frame but the first lasts some 2 to 3 us longer than the others (inferred): the firmware writes
 this point's colours over SPI before it starts the timer anew. With frames of 60 ms that is 50 ppm of the duration,

@@ -224,7 +224,8 @@ class NidaqDac:
                 _ = self.card.properties.serial_num
 
     def level(self) -> float | None:
-        """The drive at the mirror's output, as the card measures it; None if it cannot, or cannot at present."""
+        """The drive at the mirror's output, as the card measures it; None if the card cannot measure it, or cannot at
+        present."""
         if self._simulated:  # NI's simulated cards measure a sine wave
             return None
         try:
@@ -260,7 +261,8 @@ class NidaqDac:
                 task.start()
 
     def add_counter(self, task: Any, name: str, delay: int, low: int, high: int) -> None:
-        """Add a counter to a task: `delay` edges of the mirror's clock, then pulses of `high` edges, `low` between."""
+        """Add the counter `name` to a task. It waits for `delay` edges of the mirror's sample clock, then makes pulses
+        that are high for `high` edges and low for `low` edges."""
         task.co_channels.add_co_pulse_chan_ticks(
             f"{self.card.device}/{name}",
             self.card.terminal(self.config.counted_at or "ao/SampleClock"),

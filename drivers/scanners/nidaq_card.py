@@ -116,7 +116,7 @@ class NiCard:
             self._limit_s = self._call_s
 
     def limit_waits(self) -> None:
-        """Wait no longer for the server, from now on, than a close may take."""
+        """From now on, wait for the server only as long as is allowed while a card is closed."""
         self._call_s, self._late_s = _CLOSE_S, _CLOSE_LATE_S
         self._limit_s = min(self._limit_s, _CLOSE_S)
 

@@ -100,7 +100,8 @@ class TeensyLine:
         raise ProtocolError(f"{self._name} answered {shown} with {answer[:40]!r}; check its firmware")
 
     def send(self, command: str) -> None:
-        """Send a command without a tag, and do not wait for the answer. It has no tag either, and is dropped later."""
+        """Send a command without a tag, and do not wait for the answer. The answer has no tag either, and is dropped
+        later."""
         self._write(command.encode("ascii", "replace"))
 
     def status(self) -> SyncStatus:
