@@ -9,7 +9,7 @@ NS_PER_S = 1_000_000_000
 
 @runtime_checkable
 class Clock(Protocol):
-    """Monotonic time and waiting. It is passed in everywhere, so that tests of code that waits take no real time."""
+    """Monotonic time and waiting. Code that waits is given a clock, so that its tests take no real time."""
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary start; never decreases."""
@@ -33,20 +33,20 @@ class SystemClock:
         return time.monotonic_ns()
 
     def sleep(self, seconds: float) -> None:
-        """Block this thread for `seconds`."""
+        """Block this thread for `seconds`; zero and negative values return at once."""
         if seconds > 0:
             time.sleep(seconds)
 
 
 class VirtualClock:
-    """A clock that stands still until it is advanced. Thread-safe. Waiting on it takes no real time."""
+    """A clock whose time changes only when it is advanced. Thread-safe. `sleep` advances it and takes no real time."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._lock = threading.Lock()
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The present virtual time."""
+        """The present virtual time in nanoseconds."""
         with self._lock:
             return self._now_ns
 
@@ -57,6 +57,7 @@ class VirtualClock:
                 self._now_ns += round(seconds * NS_PER_S)
 
     def advance_to_ns(self, t_ns: int) -> None:
-        """Advance to `t_ns`. A time that has already passed changes nothing: the clock never runs backwards."""
+        """Advance to `t_ns`, in nanoseconds. A time that has already passed changes nothing: the clock never runs
+        backwards."""
         with self._lock:
             self._now_ns = max(self._now_ns, t_ns)

@@ -7,7 +7,8 @@ VARIABLE = "PYTHON_CPU_COUNT"
 
 
 def cores() -> int:
-    """Number of cores that this process may use, at least 1."""
+    """Number of cores that this process may use, at least 1: the environment variable `PYTHON_CPU_COUNT` if that is a
+    whole number, else the number that the system allows it."""
     told = os.environ.get(VARIABLE, "")
     if told.isdecimal():
         return max(1, int(told))

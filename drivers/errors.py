@@ -39,7 +39,7 @@ GONE = (DeviceDisconnected, DeviceTimeout)
 
 
 class DeviceFault(DeviceError):
-    """Raised when a device reports a fault of its own, or does something else than it was told."""
+    """Raised when a device reports a fault of its own, or does not do what it was told."""
 
 
 class EmergencyStop(DeviceFault):
@@ -47,7 +47,7 @@ class EmergencyStop(DeviceFault):
 
 
 class InterlockOpen(DeviceError):
-    """Raised when the interlock of a laser that is armed, or is to be armed, is open."""
+    """Raised when a laser's interlock is open while the laser is armed or about to be armed."""
 
 
 class LimitExceeded(DeviceError):
@@ -75,14 +75,12 @@ class CorruptBlock(ProtocolError):
 
 class UnsupportedBlock(ProtocolError):
     """Raised when a block is of a kind that `drivers.spb1` does not read as frames: another major version, several bits
-    per pixel, sparse, summed, with every k-th frame only, or a control block.
-    """
+    per pixel, sparse, summed frames, only every k-th frame, or a control block."""
 
 
 class GuardLost(DeviceError):
-    """Raised when the guard process that owns the ports of laser and gate is gone. Says which devices were made safe,
-    if that is known by then.
-    """
+    """Raised when the guard process that owns the ports of laser and gate is gone. The message says which devices were
+    made safe, if that is known by then."""
 
 
 class RingOverflow(DeviceError):
@@ -90,6 +88,5 @@ class RingOverflow(DeviceError):
 
 
 class UnknownKind(DeviceError):
-    """Raised when the registry has no usable device kind of the name that was asked for. Lists the kinds there are, or
-    says why this one cannot be used.
-    """
+    """Raised when the registry has no usable device kind of the name that was asked for. The message lists the kinds
+    there are, or says why this one cannot be used."""

@@ -1,5 +1,5 @@
-"""Binary frames in memory. A block holds consecutive frames: a record and packed bits for each. A run in this module is
-one start of the SPAD."""
+"""Binary frames in memory. A block holds consecutive frames, each with a record and its packed bits. A run in this
+module is one start of the SPAD."""
 
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -55,7 +55,7 @@ class BlockFlag(IntFlag):
 
 
 class BlockStatus(IntEnum):
-    """Ways in which a block can end (SPB1 1.0 trailer, offset 4)."""
+    """Ways in which a block can end (SPB1 1.0 trailer, offset 4; docs/reference/spb1.md)."""
 
     OK = 0
     TRUNCATED = 1
@@ -116,7 +116,8 @@ class FrameBlock:
 
     records: (n,) of `FRAME_RECORD`.
     bits: uint8 (n, height, row bytes), packed along the width, most significant bit first (numpy `packbits` order). Pad
-    bits are 0; the row bytes are a multiple of `ROW_ALIGN_BYTES`.
+    bits are 0; the row bytes are a multiple of `ROW_ALIGN_BYTES`. status: a `BlockStatus`, or another number that the
+    trailer states.
     """
 
     header: BlockHeader
@@ -131,7 +132,7 @@ class FrameBlock:
 
     @property
     def frame_numbers(self) -> NDArray[np.int64]:
-        """Numbers of the frames since the run's start, int64 (n,)."""
+        """Numbers of the frames, counted from 0 at the run's start with lost ones included; int64 (n,)."""
         return self.header.first_frame + np.arange(self.n_frames, dtype=np.int64) * self.header.frame_step
 
     @property

@@ -1,6 +1,6 @@
-"""Reads JSON texts that may be damaged. A text that nests too deep, holds an integer of more than 20 digits, a number
-that is not finite, a key that no terminal can show or half a character, raises ValueError like any other damage.
-"""
+"""Reads JSON texts that may be damaged. Like any other damage, each of the following raises ValueError: nesting that is
+too deep, an integer of more than 20 digits, a number that is not finite, a key that no terminal can show, and half a
+character (a lone UTF-16 surrogate)."""
 
 import json
 import math

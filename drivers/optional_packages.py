@@ -1,4 +1,4 @@
-"""Packages beside this one: what they add to it, and the command that installs one which only parts of it need."""
+"""Packages beside this one: what they add to it, and the command that installs an optional one."""
 
 import re
 import sys
@@ -8,7 +8,8 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, r
 
 def added(group: str) -> tuple[EntryPoint, ...]:
     """The entry points of a group, ours among them. A package that is installed after the first call is not seen,
-    unless the import path changes: reading the files of all packages takes 10 ms, and opening a rig asks 25 times."""
+    unless the import path changes. The answer is cached, since reading the files of all packages takes 10 ms and
+    opening a rig asks 25 times."""
     return _installed(group, tuple(sys.path))
 
 

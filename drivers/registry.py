@@ -20,7 +20,8 @@ SLOTS = ("spad", "scanner", "laser", "sync", "world")
 
 
 class KindConfig(BaseModel):
-    """Base of every kind's config. Unknown keys are refused and values cannot change. `kind` names the entry point."""
+    """Base of every kind's config. Unknown keys are refused, and values cannot be changed. `kind` names the entry
+    point."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -34,8 +35,7 @@ class KindConfig(BaseModel):
 @dataclass(frozen=True, slots=True)
 class Surroundings:
     """The things that a device needs besides its config. Real devices use clock, ports and tap; simulated devices use
-    clock, world and seed.
-    """
+    clock, world and seed (of their random numbers)."""
 
     clock: Clock
     world: World | None
@@ -114,7 +114,8 @@ def _quantity(name: str, value: Any, dimension: str) -> str:
 
 
 def alone() -> Surroundings:
-    """The surroundings of a real device that is opened by itself."""
+    """The surroundings of a real device that is opened by itself: the system's clock, and no world, emulated ports or
+    tap."""
     return Surroundings(SystemClock(), None, 0)
 
 
@@ -130,8 +131,8 @@ def lookup(slot: str, kind: str) -> Kind:
 
 
 def load_entry(slot: str, kind: str, entries: Iterable[EntryPoint], wanted: type[Loaded]) -> Loaded:
-    """Load the one entry point of this name among those of a slot, which must be a `wanted`. Raises `UnknownKind`, with
-    the choices or with the reason why the entry cannot be used."""
+    """Load the only entry point named `kind` among `entries`, which are those of a slot. The loaded object must be a
+    `wanted`. Raises `UnknownKind`, with the choices or with the reason why the entry cannot be used."""
     entries = tuple(entries)
     found = {entry.value: entry for entry in entries if entry.name == kind}
     if not found:

@@ -1,11 +1,11 @@
 """The ring of block slots between one source thread and its readers: allocated once, no copies, every loss counted.
 
 The source claims free slots (several at once if USB transfers are queued), fills them and publishes them in the order
-of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a
-block's slot until it asks for the next block; with `holds` = n, until it asks for the n-th block after the held one.
+of claiming. A required reader gets every block in that order; an optional one may miss some. A reader holds a block's
+slot until it asks for the next block. A reader with `holds` = n holds it until it asks for the n-th block after it.
 
-The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. If they claim and
-get no slot, and `ring.waits` is False, they drop the block, count it as lost and call `mark_overflow`.
+The ring's `on_full` says what happens when no slot is free, so drivers need not know the policy. If a driver claims a
+slot and gets none, and `ring.waits` is False, it drops the block, counts it as lost and calls `mark_overflow`.
 """
 
 import threading
@@ -38,11 +38,12 @@ class OnFull(Enum):
 
 
 class BlockRing:
-    """`slots` pieces of memory of `stride` bytes each, all allocated, and each page written once, on creation.
+    """Memory for `slots` blocks of `stride` bytes each. On creation all of it is allocated, and each page is written
+    once.
 
     One source thread calls `claim`, `publish`, `discard`, `mark_overflow` and `finish`; each reader belongs to one
-    thread. holds_s: seconds of the stream that the ring can hold, for the message of an overflow; None if unknown.
-    Raises ValueError if `slots` or `stride` is below 1.
+    thread. on_full: fate of a block for which there is no free slot. holds_s: seconds of the stream that the ring can
+    hold, for the message of an overflow; None if unknown. Raises ValueError if `slots` or `stride` is below 1.
     """
 
     def __init__(self, slots: int, stride: int, *, on_full: OnFull = OnFull.WAIT, holds_s: float | None = None) -> None:
@@ -114,9 +115,8 @@ class BlockRing:
             return reader
 
     def claim(self, timeout_s: float) -> NDArray[np.uint8] | None:
-        """Memory of a free slot, uint8 (stride,), still with the bytes of an older block. None if no slot is free. A
-        ring that `waits` first waits for a slot, at most `timeout_s`. Raises `WrongState` after `finish`.
-        """
+        """Memory of a free slot, uint8 (stride,), which may still hold the bytes of an older block. None if no slot is
+        free. A ring that `waits` first waits for a slot, at most `timeout_s`. Raises `WrongState` after `finish`."""
         with self._changed:
             self._require_unfinished("claim")
             self._any_claimed = True
@@ -128,7 +128,8 @@ class BlockRing:
             return view
 
     def publish(self, block: FrameBlock) -> None:
-        """Hand readers the block in the oldest claimed slot. Raises `WrongState` if there is none or after `finish`."""
+        """Hand the block to the readers. Its memory must be the oldest claimed slot. Raises `WrongState` if no slot is
+        claimed, or after `finish`."""
         with self._changed:
             self._require_unfinished("publish")
             slot = self._oldest_claimed("publish")
@@ -146,7 +147,7 @@ class BlockRing:
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Give the oldest claimed slot back unpublished. Raises `WrongState` if there is none."""
+        """Give the oldest claimed slot back unpublished. Raises `WrongState` if no slot is claimed."""
         with self._changed:
             self._free.append(self._oldest_claimed("discard"))
             self._changed.notify_all()
@@ -168,17 +169,15 @@ class BlockRing:
             )
 
     def end_waits(self) -> None:
-        """Make `claim` return at once from now on. Call it when the source is to end and readers may never take blocks
-        again.
-        """
+        """Make `claim` return at once from now on, with None if no slot is free. Call it when the source is to end and
+        readers may never take blocks again. May be called from any thread."""
         with self._changed:
             self._patient = False
             self._changed.notify_all()
 
     def finish(self, error: BaseException | None = None) -> None:
-        """End the stream. Readers get the blocks that are left, then None, or `error` is raised. A second call changes
-        nothing.
-        """
+        """End the stream. Readers get the blocks that are left; after these `next` returns None, or raises `error` if
+        one is given. A second call changes nothing."""
         with self._changed:
             if not self._finished:
                 self._finished = True
@@ -254,7 +253,8 @@ class RingReader:
             self._release_held()
 
     def close(self) -> None:
-        """Release all blocks and take no more, so that the source no longer waits for this reader."""
+        """Release all blocks and take no more, so that the source no longer waits for this reader. A second call does
+        nothing."""
         with self._ring._changed:
             self._closed = True
             self._release_held()
@@ -268,7 +268,7 @@ class RingReader:
         self.close()
 
     def __iter__(self) -> Iterator[FrameBlock]:
-        """Blocks until the end."""
+        """Blocks until the end of the stream. Raises as `next`."""
         while (block := self.next()) is not None:
             yield block
 

@@ -1,4 +1,5 @@
-"""Quantities with units in config files: text such as "10 us" on disk, a number in code (SI; rates of rain in m/h).
+"""Quantities with units in config files: text such as "10 us" on disk, a number in code. The number is in SI units,
+except that rain rates are in m/h.
 
 A field typed `Seconds` takes text such as "10 us" and nothing else. A bare number, another dimension, NaN and infinity
 are refused. Values written back (`model_dump(mode="json")`) are text again and read back to the very same number.
@@ -78,7 +79,8 @@ DIMENSIONS: Mapping[str, Dimension] = {dimension.name: dimension for dimension i
 
 
 def parse_quantity(text: object, dimension: str) -> float:
-    """The SI number that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h).
+    """The number in SI units that a text such as "10 us" means (ratio: 1 for 100 %; rain rate: m/h). dimension: a key
+    of `DIMENSIONS`.
 
     Correctly rounded: "0.1 us" gives the float 1e-07. Raises ValueError, with a message of one line, for text of
     another form and for numbers that no float can hold.
@@ -94,7 +96,8 @@ def parse_quantity(text: object, dimension: str) -> float:
 
 
 def parse_exact(text: object, dimension: str) -> Fraction:
-    """Parse as `parse_quantity` does, but exactly and without bounds. Both accept fractions ("100000/3 Hz")."""
+    """Parse as `parse_quantity` does, but exactly and without bounds. Both accept fractions ("100000/3 Hz"). Raises
+    ValueError for text of another form."""
     known = DIMENSIONS[dimension]
     like = f'write the {known.name} with a unit, like "{known.example}"'
     if not isinstance(text, str):
@@ -123,7 +126,8 @@ def parse_fraction(text: object) -> Fraction:
 
 
 def format_quantity(value: float | Fraction, dimension: str) -> str:
-    """A text with a unit that reads back to exactly `value`. Raises ValueError if `value` is not finite.
+    """A text with a unit that reads back to exactly `value`, a number in SI units. dimension: a key of `DIMENSIONS`.
+    Raises ValueError if `value` is not finite.
 
     Prefers, in this order: a number without exponent; a number between 0.1 and 1000; the shortest text, where the first
     unit of the dimension may take one character more; that first unit; a number of at least 1.
@@ -197,7 +201,8 @@ IN_NAMES: Mapping[str, str] = {
 
 
 def dimension_of(field: FieldInfo) -> str | None:
-    """The dimension of a config's field that is a quantity, or may be one; None if it is something else."""
+    """Name of the dimension of a config's field if that is a quantity or, like `Seconds | None`, may be one; else
+    None."""
     marks = [mark for part in get_args(field.annotation) for mark in get_args(part)]
     return next((mark.dimension for mark in (*field.metadata, *marks) if isinstance(mark, _Text)), None)
 

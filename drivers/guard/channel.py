@@ -41,14 +41,15 @@ class Channel:
         return self._end.fileno()
 
     def send(self, message: Message, within_s: float = 0.0) -> None:
-        """Queue a message and send what the socket accepts within `within_s`. A peer that is gone raises no error."""
+        """Queue a message and send what the socket accepts within `within_s`; the rest waits for the next `send` or
+        `flush`. If the other process is gone, the message is dropped without an error."""
         line = json.dumps(message, separators=(",", ":")).encode() + b"\n"
         with self._lock:
             self._unsent += line
         self.flush(within_s)
 
     def flush(self, within_s: float = 0.0) -> None:
-        """Send what is still queued, as much as the socket accepts within `within_s`."""
+        """Send what is still queued, or as much of it as the socket accepts within `within_s`."""
         ends_at = time.monotonic() + within_s
         with self._lock:
             while self._unsent:
@@ -93,8 +94,8 @@ def error_message(error: BaseException) -> list[str]:
 
 
 def error_from(message: list[str]) -> DeviceError:
-    """The error that a message carries, or, if its class is not in `drivers.errors`, a `ProtocolError` that blames the
-    guard."""
+    """The error that a message from `error_message` carries. If its class is not in `drivers.errors`, a `ProtocolError`
+    that says that the guard failed."""
     name, text = message
     kind = getattr(drivers.errors, name, None)
     if isinstance(kind, type) and issubclass(kind, DeviceError):
@@ -103,7 +104,8 @@ def error_from(message: list[str]) -> DeviceError:
 
 
 def plain_ports(ports: Mapping[str, Any]) -> dict[str, str]:
-    """Addresses of the emulated ports by name, without USB and serial ports that are only in this process's memory."""
+    """Addresses of the emulated ports, by name. USB and serial ports that exist only in this process's memory are left
+    out: the guard cannot open them."""
     return {name: port.address for name, port in ports.items() if port.usb_backend is None and port.serial_port is None}
 
 
@@ -125,13 +127,14 @@ class Heartbeat:
     """The shared page of memory. Each of the two processes has an object of this class for it."""
 
     def __init__(self, handle: int) -> None:
-        """handle: file descriptor of an anonymous file of at least a page."""
+        """handle: file descriptor of an anonymous file of at least one memory page; `close` closes it."""
         self.handle = handle
         self._page = mmap.mmap(handle, mmap.PAGESIZE)
 
     @classmethod
     def create(cls) -> "Heartbeat":
-        """A new page in memory, not in a file on a disk, which could block. Raises `DeviceError` outside Linux."""
+        """A new page in memory, not in a file on a disk, which could block. Its frame number is -1. Raises
+        `DeviceError` outside Linux."""
         require_linux()
         handle = os.memfd_create("spadrig-heartbeat")
         os.ftruncate(handle, mmap.PAGESIZE)

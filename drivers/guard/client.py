@@ -59,12 +59,12 @@ class GuardedLaser(_Guarded, LineLaser):
 
     @property
     def limits(self) -> LaserLimits:
-        """The limits that the guard read."""
+        """The limits that the guard read when it opened the laser."""
         return LaserLimits(*self._about["limits"])
 
     @property
     def gate_only(self) -> bool:
-        """Whether only the gate ends its light, as the guard read."""
+        """Whether only the gate ends the laser's light; the guard read this when it opened the laser."""
         return bool(self._about["gate_only"])
 
     def _do_status(self) -> LaserStatus:
@@ -91,11 +91,12 @@ class GuardedSync(_Guarded, SyncSource):
 
     @property
     def resolution_s(self) -> float:
-        """The resolution that the guard read."""
+        """The resolution that the guard read when it opened the device."""
         return float(self._about["resolution_s"])
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
-        """The limit of the device behind the guard; None if it has none."""
+        """Largest number of times that the device can repeat `pulses`, asked through the guard; None if there is no
+        limit."""
         most: int | None = self._ask("most_repeats", _plain(pulses))
         return most
 
@@ -147,7 +148,7 @@ class Guard:
     """Owns laser and sync source in a separate process, from its creation to `close`.
 
     `laser` and `sync` raise what opening them raised, so that a rig can list all problems at once. A device whose
-    config is None is not guarded. Thread-safe.
+    config is None is not guarded. Thread-safe, except that only the source thread calls `beat` and `wait`.
     """
 
     def __init__(
@@ -159,8 +160,12 @@ class Guard:
         limits: GuardLimits | None = None,
         tap: TapFile | None = None,
     ) -> None:
-        """Start the guard without waiting until it has opened the devices. Raises `UnknownKind`, or `DeviceError`
-        outside Linux."""
+        """Start the guard without waiting until it has opened the devices.
+
+        laser, sync: configs of the devices. ports: emulated ports by name. limits: None means the defaults of
+        `GuardLimits`. tap: the file in which the guard records what passes the devices' ports. Raises `UnknownKind`, or
+        `DeviceError` outside Linux.
+        """
         configs = {slot: config for slot, config in (("laser", laser), ("sync", sync)) if config is not None}
         ports = ports or {}
         self._rescue = Rescue(configs, ports)
@@ -215,7 +220,7 @@ class Guard:
 
     @property
     def lost(self) -> bool:
-        """Whether the guard's process is gone."""
+        """Whether the guard's process is gone; also True after `close`."""
         return self._lost.is_set()
 
     @property
@@ -224,9 +229,8 @@ class Guard:
         return self._process.pid
 
     def beat(self, frame: int) -> None:
-        """Report the last frame number received. It is called for every block and only writes to memory. Raises
-        `failure` if there is one.
-        """
+        """Report the last frame number received. Call it on the source thread for every block; it only writes to
+        memory. Raises `failure` if there is one."""
         self._heartbeat.waited_s = 0.0
         self._heartbeat.frame = frame
         if self.failure is not None:
@@ -243,9 +247,9 @@ class Guard:
     def ask(self, slot: str, verb: str, *arguments: Any) -> Any:
         """Have the guard call a device's method on behalf of a proxy; returns its result or raises its error.
 
-        Raises `failure` instead of switching anything on, `DeviceTimeout` if it takes too long, and `GuardLost` if the
-        guard is gone. A method that makes a device safe then first waits, at most `LOWER_S`, until the application has
-        tried to make the devices safe itself.
+        Raises `failure` instead of switching anything on, `DeviceTimeout` if the answer takes too long, and `GuardLost`
+        if the guard is gone. A method that makes a device safe then first waits, at most `LOWER_S`, until the
+        application has tried to make the devices safe itself.
         """
         if self.failure is not None and verb in _ENABLING:
             raise self.failure
@@ -269,7 +273,8 @@ class Guard:
         return self._told(answer, verb)["result"]
 
     def close(self) -> None:
-        """Close both devices, which leaves them safe, and end the guard. A second call does nothing."""
+        """Close both devices, which leaves them safe, and end the guard. A second call does nothing. Raises
+        `DeviceError` if a device could not be left safe; the guard has ended even then."""
         if self._closing:
             return
         self._closing = True

@@ -1,6 +1,6 @@
 """A device that the guard owns: opened from its config, used through the application's messages, made safe at the end.
 
-Each device has two lanes: threads (`JobThread`) that do one job after the other.
+Each device has two lanes. A lane is a thread (`JobThread`) that does one job after the other.
 """
 
 import itertools
@@ -70,8 +70,10 @@ class GuardedDevice:
         tap: dict[str, Any] | None,
         watch: tuple[Callable[[DeviceError], object], Callable[[], bool]],
     ) -> None:
-        """tap: fields of the `TapFile` that records its port; None: nothing is recorded. watch: arguments of
-        `LineLaser.watch` while the device is an armed laser."""
+        """slot: "laser" or "sync". config: the device's config as JSON data. ports: addresses of emulated ports by
+        name. tap: fields of the `TapFile` in which the port's traffic is recorded; None: nothing is recorded. watch:
+        arguments of `LineLaser.watch`, which are passed while the device is an armed laser. Raises `UnknownKind`, or
+        pydantic's `ValidationError` for a wrong config."""
         self.slot = slot
         self._watch = watch
         self.device: Any = None
@@ -96,7 +98,8 @@ class GuardedDevice:
         self._create = partial(kind.create, model, surroundings)
 
     def open(self) -> dict[str, Any]:
-        """Open the device; returns what its proxy in the application can tell without asking. May raise DeviceError."""
+        """Open the device; returns the properties that its proxy in the application can then tell without asking. May
+        raise DeviceError."""
         self.device = self._create()
         about: dict[str, Any] = {"name": self.device.name, "identity": self.device.identity}
         if isinstance(self.device, LineLaser):
@@ -151,9 +154,8 @@ class GuardedDevice:
         return self.unsafe and not self.trying and time.monotonic() >= self._next_try
 
     def try_safe(self) -> None:
-        """Try once to make the device safe: all outputs low, or the laser paused and, if it was armed, disarmed. A
-        lost port is opened again first. Runs on a lane.
-        """
+        """Try once to make the device safe: all outputs low, or the laser paused and, if it was armed, disarmed. A lost
+        port is opened again first. A `DeviceError` is only logged, and `unsafe` then stays True. Runs on a lane."""
         try:
             if self.port_lost:
                 self.device = self._create()  # DeviceError while it is not plugged in again

@@ -2,11 +2,11 @@
 
 The main thread never touches a device. It reads messages, looks at the application every 10 ms and queues jobs for the
 threads of the devices (lanes, see `drivers.guard.owned`). The light is ended (a "trip") when the application ends, is
-stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or falls
-silent; or when the guard is told to end. In a trip all outputs of the gate go low; at the same time the laser is
-paused and, if it was armed, disarmed. An application that was stopped or took no frames is killed, unless it makes its
-rig safe in time. The ports are closed when the guard ends. If frames stop because the gate's program has ended, the
-laser is only paused. "The gate" in this module is the sync source, which drives the gate.
+stopped or takes no frames; when a port hangs up; when the laser reports an open interlock or a fault, or falls silent;
+or when the guard is told to end. In a trip all outputs of the gate go low; at the same time the laser is paused and, if
+it was armed, disarmed. An application that was stopped or took no frames is killed, unless it makes its rig safe in
+time. The ports are closed when the guard ends. If frames stop only because the gate's program has ended, there is no
+trip; the laser is just paused. "The gate" in this module is the sync source, which drives the gate.
 
 `Rescue` is for the opposite case, when the guard is gone: the application opens the ports, which are free then, and
 makes the devices safe as far as it can.
@@ -79,7 +79,8 @@ class GuardProcess:
         self._terminated = False
 
     def run(self) -> int:
-        """Serve the application until it says goodbye or is gone, or a signal tells the guard to end (SIGTERM)."""
+        """Serve the application until it says goodbye or is gone, or the signal SIGTERM tells the guard to end. Then
+        leave the devices safe and close them; returns the exit code. Must run on the main thread."""
         signal.signal(signal.SIGTERM, self._on_terminate)
         before = seen = time.monotonic()
         while not self._ending:
@@ -371,10 +372,12 @@ OFF_TIMES = 2
 
 
 class Rescue:
-    """Makes gate and laser safe at the same time, each on its own thread."""
+    """Makes gate and laser safe from the application once the guard is gone: at the same time, each on its own
+    thread."""
 
     def __init__(self, configs: Mapping[str, Any], ports: Mapping[str, Endpoint]) -> None:
-        """Import the drivers, for which there is no time in a rescue."""
+        """Import the drivers now, since a rescue leaves no time for that. configs: by slot ("laser" or "sync"). ports:
+        emulated ports by name. Raises `UnknownKind`."""
         surroundings = Surroundings(SystemClock(), None, 0, ports)
         self._create: dict[str, Callable[[], Any]] = {}
         self._off: dict[str, tuple[Callable[[], SerialPort], bytes]] = {}

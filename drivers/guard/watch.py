@@ -6,8 +6,9 @@ processor or a disk. Work does not count when the source thread reports that the
 itself was held up, only a short step of that time counts: what stops the guard may have stopped the application too.
 
 The state of a process comes from /proc (proc(5), the fields of `stat`; Documentation/scheduler/sched-stats.rst of
-Linux, the first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd. The pidfd
-always names the same process and reports its end at once, even if a child that it forked still holds its sockets open.
+Linux, the first two numbers of `schedstat`: nanoseconds on a processor and waiting for one) and from a pidfd, which is
+a file descriptor for a process. It always names the same process and reports its end at once, even if a child that it
+forked still holds its sockets open.
 """
 
 import os
@@ -81,11 +82,12 @@ class FrameWatch:
     def look(
         self, elapsed_s: float, frame: int, stopped: bool, busy: Callable[[], bool], waited_s: float = 0.0
     ) -> str | None:
-        """Judge the application, `elapsed_s` after the last look; returns the fault it shows, or None.
+        """Judge the application, `elapsed_s` after the last look; returns the fault as text that follows "the
+        application", or None.
 
-        stopped: whether the process is stopped while the laser may shine. busy: called only in doubt, since it has to
-        look at every thread. waited_s: for how long the source thread has been asking the SPAD for frames without
-        getting any.
+        stopped: whether the process is stopped while the laser may shine. busy: tells whether the process is at work;
+        called only in doubt, since it has to look at every thread. waited_s: for how long the source thread has been
+        asking the SPAD for frames without getting any.
         """
         if stopped:
             return "is stopped"
@@ -120,7 +122,7 @@ class WatchedProcess:
 
     idle_thread: number of a thread that wakes up regularly by itself. On an overloaded machine it waits for a processor
     each time. Its time is not counted as work. But while it runs or waits for a processor, the process does not count
-    as asleep, since other threads may wait for the interpreter's lock that it holds.
+    as asleep, since other threads may wait for the interpreter's lock, which it holds. None: there is no such thread.
     """
 
     def __init__(self, pid: int, idle_thread: int | None = None) -> None:
@@ -140,7 +142,7 @@ class WatchedProcess:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended, as far as there is a pidfd to tell."""
+        """Whether the process has ended. Without a pidfd its end is not noticed."""
         if not self._ended and self.handle is not None:
             ready = select.poll()
             ready.register(self.handle, select.POLLIN)
@@ -153,14 +155,14 @@ class WatchedProcess:
         return _state(f"/proc/{self._pid}/stat") in ("T", "t")
 
     def note_progress(self) -> None:
-        """Count work from now on."""
+        """Count work from now on: `busy` judges the time since this call."""
         self._worked_ns = {task: _work_ns(task) for task in self._tasks()}
         self._since = time.monotonic()
         self._found_asleep = False
 
     def busy(self) -> bool:
-        """Whether its threads worked for a good part of the time since `note_progress`, or run or wait for a processor
-        or a disk now.
+        """Whether the process's threads worked for a good part of the time since `note_progress`, or now run or wait
+        for a processor or a disk.
 
         The answer is False only if this call and the one before both find the process asleep: threads are looked at one
         after the other, and work may pass from a thread not yet looked at to one that already was.
@@ -186,7 +188,7 @@ class WatchedProcess:
             return []
 
     def kill(self) -> None:
-        """Kill the process. Does nothing if it has ended."""
+        """Kill the process by SIGKILL. Does nothing if it has ended."""
         if self.ended:
             return
         with suppress(ProcessLookupError):

@@ -1,4 +1,5 @@
-"""Rule by which an apparatus (`rig.strategies.apparatus`) shares its light, and its results, whoever makes them."""
+"""The rule by which an apparatus (`rig.strategies.apparatus`) shares its light among the columns, and the form of its
+results. They are the same for every apparatus, simulated or real."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,7 +15,7 @@ whole power spread over half of the columns."""
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """Cost of a measurement. energy_j: light that left the source."""
+    """Cost of a measurement. time_s: seconds that it took. energy_j: light that left the source, in joules."""
 
     time_s: float
     energy_j: float
@@ -22,8 +23,8 @@ class Spent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PulseTimes:
-    """Arrival times of first photons. counts: (rows, width, bins) uint32; a photon in bin i came between
-    start_s + i bin_s and start_s + (i + 1) bin_s after its pulse left. pulses: number of pulses that each pixel got.
+    """Arrival times of first photons. counts: (rows, width, bins) uint32. pulses: number of pulses that each pixel got.
+    A photon in bin i came between start_s + i bin_s and start_s + (i + 1) bin_s seconds after its pulse left.
     """
 
     counts: NDArray[np.uint32]

@@ -1,4 +1,4 @@
-"""The last work on a device that nobody closed: when it is deleted, or Python ends."""
+"""The last work on a device that nobody closed. It is done when the device is deleted or Python ends."""
 
 import threading
 import weakref
@@ -8,8 +8,9 @@ from collections.abc import Callable
 def watch_for_end(device: object, end: Callable[[], object]) -> "weakref.finalize[..., object]":
     """Have `end` called when the device is deleted or Python ends, unless the finalizer that is returned is detached.
 
-    end: must not refer to the device. It is called on the main thread, or on a thread of its own: one that deletes the
-    device may be in the middle of talking to it, or a daemon, which stops when Python ends.
+    end: must not refer to the device. If the device is deleted on another thread than the main one, `end` is called on
+    a new thread: the thread that deletes the device may be in the middle of talking to it, or may be a daemon, which
+    stops when Python ends. If a `KeyboardInterrupt` breaks it off, it is called once more.
     """
     return weakref.finalize(device, _call, end)
 

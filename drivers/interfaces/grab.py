@@ -1,4 +1,4 @@
-"""Frames of a SPAD array as one array, for a notebook: `SpadArray.grab`."""
+"""Frames of a SPAD array as one array in memory, for use in a notebook: the result of `SpadArray.grab`."""
 
 import logging
 import threading
@@ -25,10 +25,10 @@ _FEWEST_SLOTS, _MOST_SLOTS = 4, 256
 class Grabbed:
     """Frames of one run, in the order in which they were exposed.
 
-    number: int64 (n,), number of each frame since the start; a number that is missing is a lost frame. bits: uint8
-    (n, height, row bytes), rows packed as by `numpy.packbits`, padded with 0 to whole 64-bit words. records: (n,) of
-    `drivers.frames.FRAME_RECORD`, with the markers seen, for example. asked: frames asked for. width: pixels of a row.
-    timing: of the frames.
+    number: int64 (n,), number of each frame since the start, from 0; the frames whose numbers are missing were lost.
+    bits: uint8 (n, height, row bytes), rows packed as by `numpy.packbits`, padded with 0 to whole 64-bit words.
+    records: (n,) of `drivers.frames.FRAME_RECORD`, with the markers seen, for example. asked: frames asked for. width:
+    pixels of a row. timing: that of the frames. ended_by: the error that ended the run early; None: it ended well.
     """
 
     number: NDArray[np.int64]
@@ -59,8 +59,11 @@ class Grabbed:
 
 
 def take(spad: "SpadArray", timing: "SpadTiming", n_frames: int, timeout_s: float) -> Grabbed:
-    """Run a configured SPAD once and copy its frames. Raises what `start` raises, and what `fill` raises before any
-    frame has come; what it raises later is logged, and `Grabbed.ended_by`. Stops the SPAD anyway."""
+    """Run a configured SPAD once and copy its frames. The SPAD is stopped in any case.
+
+    timeout_s: longest wait for frames. Raises what `start` raises. If `fill` or `stop` raises a `DeviceError`, it is
+    raised here if no frame has come; otherwise it is logged, and returned as `Grabbed.ended_by`.
+    """
     info = spad.info
     row_bytes = packed_row_bytes(info.width)
     frames = max(timing.stride // frame_bytes(info.width, info.height), 1)

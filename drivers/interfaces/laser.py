@@ -22,7 +22,7 @@ class LaserLimits:
 
 @dataclass(frozen=True, slots=True)
 class LaserStatus:
-    """The laser's own report, read anew each time."""
+    """The laser's report on itself at the time when `status` was read."""
 
     emission: bool
     """The laser emits whenever the gate is high (light = emission AND gate). False while paused, or while it warms up
@@ -58,13 +58,14 @@ class LineLaser(Device):
 
     @property
     def gate_only(self) -> bool:
-        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, as it is switched by
-        hand."""
+        """Whether only the gate ends the laser's light: `pause`, `disarm` and `close` do not, since the laser is
+        switched by hand."""
         return False
 
     @property
     def status(self) -> LaserStatus:
-        """Ask the laser. Raises `WrongState` after close. May be called from any thread."""
+        """The laser's status, asked anew each time. Raises `WrongState` after close, and another `DeviceError` if the
+        laser does not answer. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -72,26 +73,27 @@ class LineLaser(Device):
         self, on_silence: Callable[[DeviceError], object] | None, overloaded: Callable[[], bool] = lambda: False
     ) -> None:
         """Have `on_silence` called, on any thread, as soon as the laser answers a question later than it ever should
-        and says nothing when asked once more. None ends this. The guard does this while the laser is armed. Does
+        and says nothing when asked once more. None ends the watch. The guard watches a laser while it is armed. Does
         nothing for a laser that cannot be asked.
 
         overloaded: whether this host has so much to do now that it may hold up an answer.
         """
 
     def check_alive(self) -> None:
-        """Ask the laser what it answers fastest. Raises `DeviceTimeout` if it is silent, after it has told `watch`. May
-        be called from any thread. Does nothing for a laser that cannot be asked."""
+        """Ask the laser the question that it answers fastest. If it is silent, calls the function given to `watch`,
+        then raises `DeviceTimeout`. May be called from any thread. Does nothing for a laser that cannot be asked."""
 
     @property
     def changed(self) -> list[str]:
-        """Commands that put back what this driver has changed in the laser's settings; `close` sends them."""
+        """Commands that put back the settings of the laser that this driver has changed; `close` sends them."""
         return []
 
     def adopt(self, changed: Sequence[str]) -> None:
-        """Take over the settings that another process has changed, so that `close` puts them back."""
+        """Take over the settings that another process has changed, so that `close` puts them back. changed: that
+        process's `changed`."""
 
     def arm(self, power_w: float) -> None:
-        """Set the power and enable emission under the gate. Light may come later (`status.warming_up`).
+        """Set the power, in watts, and enable emission under the gate. Light may come later (`status.warming_up`).
 
         Raises `LimitExceeded`, `InterlockOpen` or `DeviceFault` before anything is enabled. If the laser then fails to
         obey, raises `DeviceError` and tries to leave it dark.
@@ -111,10 +113,10 @@ class LineLaser(Device):
         self._state = DeviceState.RUNNING
 
     def pause(self) -> None:
-        """Stop emission in a way that needs no key to resume. Allowed until `close`, also if the laser is not armed.
-        If the laser is `gate_only`, its light does not change.
+        """Stop emission in a way that needs no key to resume. Allowed until `close`, even if the laser is not armed. If
+        the laser is `gate_only`, its light does not change.
 
-        May be called from any thread, even while another one arms: the interrupted `arm` must leave the laser dark.
+        May be called from any thread, even while another one arms: the interrupted `arm` then leaves the laser dark.
         """
         self._require("pause", *OPEN_STATES)
         _log.info("%s: pause", self._name)

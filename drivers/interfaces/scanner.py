@@ -65,7 +65,7 @@ class ScanWaveform:
 
 @dataclass(frozen=True, slots=True)
 class ScannerStatus:
-    """The scanner's own report, read anew each time."""
+    """The scanner's report on itself at the time when `status` was read."""
 
     moving: bool
     """A waveform is being played, or the mirror is on its way to rest."""
@@ -96,7 +96,8 @@ class BeamScanner(Device):
 
     @property
     def status(self) -> ScannerStatus:
-        """Ask the scanner. Raises `WrongState` after close. May be called from any thread."""
+        """The scanner's status, asked anew each time. Raises `WrongState` after close, and another `DeviceError` if the
+        device is lost. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -117,7 +118,8 @@ class BeamScanner(Device):
         """Load a waveform, to be played `repeats` times without a seam; returns the exact point clock at which it will
         run.
 
-        Raises `LimitExceeded` for the first limit that is broken, with the value. Nothing moves.
+        Nothing moves. Raises `LimitExceeded`, with the value, for the first limit that the waveform breaks, and
+        `WrongState` while another one is played.
         """
         self._note_end()
         self._require("load", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
@@ -135,7 +137,8 @@ class BeamScanner(Device):
         return clock_hz
 
     def start(self) -> None:
-        """Play the waveform. The mirror is first brought to the first point, within the limits."""
+        """Play the waveform. Before that, the mirror is brought to its first point within the limits. Does not wait for
+        the waveform's end."""
         self._note_end()
         self._require("start", DeviceState.CONFIGURED, first="load" if self._state is DeviceState.READY else "stop")
         _log.info("%s: start", self._name)

@@ -1,6 +1,6 @@
 """The SPAD array: takes binary frames and fills the ring with blocks of them.
 
-It may send only a part of each row: a window that moves with the laser line. The windows stand in a table on the
+It may send only a part of each row: a window that moves with the laser line. The windows are listed in a table on the
 device. The device steps through the table by the scanner's markers and never by counting frames: a scan marker selects
 entry 0 of the next sweep's windows, the j-th line marker after it entry j (j = 1, 2, ...). A frame has one window,
 fixed at its start; a marker that arrives during a frame moves the window of the next frame.
@@ -58,8 +58,8 @@ class WindowTable:
     ) -> NDArray[np.int32]:
         """First pixel of each frame's window, int32 (n,).
 
-        marks, line: from the frames' records, which count markers up to and including their own frame. sweep: number of
-        the sweep that each frame belongs to, from 0 on, -1 before the first scan marker.
+        marks, line: these fields of the frames' records; `line` counts the line markers up to and including the frame's
+        own. sweep: number of the sweep that each frame belongs to, from 0 on, -1 before the first scan marker.
         """
         scan = (marks & _SCAN) != 0
         own = (marks & _LINE) != 0
@@ -241,7 +241,8 @@ class SpadArray(Device):
 
     @property
     def health(self) -> SpadHealth:
-        """Ask the device. Raises `WrongState` after `close`, and during a run, when its connection may be busy."""
+        """The sensor's measurements of itself, asked anew each time. Raises `WrongState` after `close`, and during a
+        run, when its connection may be busy."""
         self._require("health", DeviceState.READY, DeviceState.CONFIGURED, first="stop")
         return self._do_health()
 
@@ -281,8 +282,8 @@ class SpadArray(Device):
         Called on the application's source thread; waits at most `timeout_s` for frames, then raises `DeviceTimeout`. If
         the ring is full and `ring.waits` is true, a source that can wait waits for room, with the same time limit. Any
         other source drops the block at once, counts its frames as lost and calls `ring.mark_overflow` with their
-        number, which may raise to end the run. Calls after the end return False. If another thread calls `stop`
-        meanwhile, the call returns False early.
+        number. That call may raise an error, which ends the run. Calls after the end return False. If another thread
+        calls `stop` meanwhile, the call returns False early.
         """
         ended = (DeviceState.CONFIGURED,) if self._run_opened else ()
         self._require("fill", DeviceState.RUNNING, *ended, first="start")
@@ -294,7 +295,8 @@ class SpadArray(Device):
         return more and self._state is DeviceState.RUNNING
 
     def stop(self) -> None:
-        """End the run. Frames exposed but not published are dropped and count as lost. Does nothing without a run."""
+        """End the run. Frames exposed but not published are dropped and count as lost. Does nothing without a run.
+        Allowed until `close` and from any thread."""
         self._require("stop", *OPEN_STATES)
         if self._state is DeviceState.RUNNING:
             _log.info("%s: stop", self._name)
@@ -312,11 +314,11 @@ class SpadArray(Device):
     ) -> Grabbed:
         """Take `n_frames` whole frames and return them in memory, with the numbers of those that were lost.
 
-        frame_rate_hz: None means the highest with this exposure that the link carries. exposure_s: None means the
-        longest that a frame allows. mode: None means a stream if sensor and link can do that, else a burst. For a
-        recording, None means as it was taken. timeout_s: longest wait for frames. Raises `LimitExceeded` for what the
-        device cannot do. If the run fails, frames that have come are returned, with the error in `Grabbed.ended_by`; if
-        none have, the error is raised, `DeviceTimeout` for example.
+        frame_rate_hz: None means the highest that sensor and exposure allow, and in a stream also the link. exposure_s:
+        None means the longest that fits into a frame period. mode: None means a stream if the link carries that rate or
+        the sensor knows no burst, else a burst. For a recording, None means as it was taken. timeout_s: longest wait
+        for frames. Raises `LimitExceeded` for what the device cannot do. If the run fails, frames that have come are
+        returned, with the error in `Grabbed.ended_by`; if none have, the error is raised, `DeviceTimeout` for example.
         """
         request = self._grab_request(n_frames, frame_rate_hz, exposure_s, mode)
         return take(self, self.configure(request), n_frames, timeout_s)

@@ -27,9 +27,10 @@ HOLD_S = 0.5e-3
 class Pulse:
     """One word of a program: levels of the outputs (OR of `OUT_*`), and their duration.
 
-    duration_s: if None, as long as the scan marker is low, so that the word waits for a sweep.
-    held: the gate stays high only while the scan marker is high, which the source checks at least every `HOLD_S`. If a
-    scanner stops, is unplugged or loses its program, the light therefore goes off even if nobody else has noticed.
+    duration_s: seconds. None: the word lasts as long as the scan marker is low, so that it waits for a sweep.
+    held: the gate stays high only while the scan marker is high, which the source checks at least every `HOLD_S`
+    seconds. If a scanner stops, is unplugged or loses its program, the light therefore goes off even if nobody else has
+    noticed.
     """
 
     outputs: int
@@ -43,7 +44,8 @@ def slices(duration_s: float) -> int:
 
 
 def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
-    """The pulses as a source plays them: each held one is split into its parts, with a wait before each part."""
+    """The pulses as a source plays them: each held pulse is split into equal parts (`slices`), with a wait for the scan
+    marker before each part."""
     played: list[Pulse] = []
     for pulse in pulses:
         if not pulse.held or pulse.duration_s is None:
@@ -58,7 +60,7 @@ def sliced(pulses: Sequence[Pulse]) -> list[Pulse]:
 
 @dataclass(frozen=True, slots=True)
 class SyncStatus:
-    """The device's own report, read anew each time."""
+    """The device's report on itself at the time when `status` was read."""
 
     state: Literal["stopped", "waiting", "running", "aborted"]
     """State of the program. A device that cannot tell whether its program waits for the scan marker says "running"."""
@@ -72,7 +74,7 @@ class SyncSource(Device):
     @property
     @abstractmethod
     def resolution_s(self) -> float:
-        """Time step of the device: durations are rounded to multiples of it."""
+        """Time step of the device in seconds: durations are rounded to multiples of it."""
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int | None:
         """Largest number of times that one program can repeat `pulses`; None if there is no limit."""
@@ -80,7 +82,8 @@ class SyncSource(Device):
 
     @property
     def status(self) -> SyncStatus:
-        """Ask the device. Raises `WrongState` after close. May be called from any thread."""
+        """The device's status, asked anew each time. Raises `WrongState` after close, and another `DeviceError` if the
+        device does not answer. May be called from any thread."""
         self._require("status", *OPEN_STATES)
         return self._do_status()
 
@@ -100,7 +103,8 @@ class SyncSource(Device):
         _log.info("%s: program of %d words, %d times", self._name, len(pulses), repeats)
 
     def run(self) -> None:
-        """Play the program from its first word."""
+        """Begin to play the program from its first word; does not wait for its end. Raises `WrongState` if no program
+        is loaded or one is being played."""
         self._note_end()
         self._require("run", DeviceState.CONFIGURED, first="program" if self._state is DeviceState.READY else "abort")
         _log.info("%s: run", self._name)

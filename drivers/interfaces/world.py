@@ -13,7 +13,8 @@ class SweepTruth:
 
     x_px: float32 (rows, columns), true stripe position in each image row, in pixels of the raw image; NaN = no stripe.
     depth_m: float32 (rows, width), true z per camera pixel; NaN = nothing there.
-    trusted: bool (rows, width), False where the scene's depth was guessed and nothing should be scored; None: nowhere.
+    trusted: bool (rows, width), False where the scene's depth was guessed and nothing should be scored; None: no depth
+    was guessed.
     """
 
     x_px: NDArray[np.float32]
@@ -29,7 +30,7 @@ class World(Protocol):
     ) -> SweepTruth:
         """The truth of one sweep.
 
-        commands: (columns,), the scanner command of each column when the first image row was exposed.
+        commands: (columns,), normalised drive of the scanner for each column when the first image row was exposed.
         velocity_per_s: speed of the command during the sweep, negative if it fell.
         time_s: (columns,), seconds from the SPAD's last start until each column was exposed, ascending or descending,
           for worlds in which something moves. None: the time when the world was made.

@@ -3,19 +3,20 @@
 Commands and replies are in docs/reference/devices/cobolt.md. Sources: cobolt-lasers/pycobolt 1333e53 (2025-09),
 python-microscope `lights/cobolt.py`, and the vendor's adapter for Micro-Manager (mmCoreAndDevices 8431eb1,
 DeviceAdapters/CoboltOfficial). Old firmware may send junk before a reply. The laser monitors its temperatures itself
-and reports fault 1.
+and reports a wrong one as fault 1.
 
-There are two command languages, that of the first 06-MLD lasers and a SCPI-like one. Which of them a laser speaks is
-asked and not taken from its model number, since an 06-MLD comes with either firmware. A 06-DPL is refused, since its
-power follows a gate only up to about 1 kHz. Not every unit knows every question: state of key or autostart counts as
-unknown if the question is refused.
+There are two command languages: that of the first 06-MLD lasers, and a SCPI-like one. The driver asks which of them the
+laser speaks: the model number does not say it, since an 06-MLD comes with either firmware. An 06-DPL is refused, since
+its power follows a gate only up to about 1 kHz. Not every unit knows every question: if it refuses one, the state of
+its key or autostart counts as unknown.
 
-`pause` must not need the key afterwards, as `l0` (off) does (pycobolt issue 6). It blanks the light as the makers do:
-by `las:paus 1`, or by `l0r`, which is the shutter of the vendor's adapter; an 06-MLD that knows no `l0r` goes to
-constant current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set to 0 too: that is what
-the next program can read. Whether a power of 0 alone is dark is in no source. If mode and power do not read back as
-dark, `pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled the key must
-then be turned off and on before the laser starts again. With autostart disabled it need not, so `close` sends `l0` too.
+After `pause` the laser must come on again without its key. After `l0` (off) it does not (pycobolt issue 6). So `pause`
+blanks the light as the makers do: with `las:paus 1`, or with `l0r`, the shutter of the vendor's adapter; an 06-MLD that
+knows no `l0r` goes to constant current at 0 mA, as in that adapter. No blanking can be read back, so the powers are set
+to 0 too: the next program can read these. Whether a power of 0 alone is dark is in no source. If mode and power do not
+read back as dark, `pause` switches the laser off. `disarm` sets the powers to 0 and sends `l0`; with autostart enabled
+the key must then be turned off and on before the laser starts again. With autostart disabled the key is not needed, so
+`close` sends `l0` too.
 """
 
 import logging
@@ -61,7 +62,7 @@ class CoboltFraming:
         return reply == DONE
 
     def asks(self, command: str) -> bool:
-        """Whether it is a question."""
+        """Whether the command is a question."""
         return "?" in command
 
     def encode(self, command: str) -> bytes:
@@ -69,7 +70,7 @@ class CoboltFraming:
         return command.encode("ascii") + b"\r"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to the command, without junk before it and without the echo if that is on; "" if there is none."""
+        """The reply to the command, without junk or an echo of the command before it; "" if there is none."""
         for _ in range(_MOST_LINES):
             reply = _JUNK.sub("", read_line().rpartition(command)[2].strip())
             if reply:
@@ -176,7 +177,7 @@ whatever its language."""
 
 
 def classify(model: str) -> str:
-    """The laser family of a model number; "unknown" if it is of none."""
+    """The laser family of a model number; "unknown" if no family has such numbers."""
     return next((family for family, numbers in FAMILIES.items() if re.search(numbers, model)), "unknown")
 
 
@@ -199,7 +200,7 @@ class CoboltLaser(SerialLaser):
     def __init__(
         self, line: Dialogue, dialect: Dialect, name: str, limits: LaserLimits, autostart: bool | None
     ) -> None:
-        """autostart: whether it is enabled; None: the laser does not say."""
+        """autostart: whether the laser's autostart is enabled; None: the laser does not say."""
         super().__init__(name, line, limits)
         self._dialect = dialect
         self._autostart = autostart
@@ -439,7 +440,8 @@ class CoboltLaser(SerialLaser):
 
 
 def create(config: CoboltConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> CoboltLaser:
-    """Open the laser and identify it; changes nothing about it."""
+    """Open the laser and identify it; changes nothing about it. Raises `DeviceError` if that fails, or for a laser that
+    this driver cannot run."""
     return open_laser("cobolt", config, surroundings, CoboltFraming(), timing, partial(_identify, config), _off(config))
 
 

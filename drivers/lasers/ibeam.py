@@ -4,18 +4,19 @@ Commands and replies, with their sources, are in docs/reference/devices/ibeam.md
 those of other clients.
 
 The light is the sum of the channels. Channel 2 is the working level and the only one that the gate switches; channel 1
-is a bias that shines whatever the gate does. So every other channel is set to a level of 0, which is read back, and
-channel 2 gets its power last, once `sta ext` says that the input has control. `laser on` may bring back other channels
+is a bias that shines whatever the gate does. So every other channel is set to a level of 0, and that is read back.
+Channel 2 gets its power last, once `sta ext` says that the input has control. `laser on` may bring back other channels
 than before, so they are looked at again after it. The mode FINE would move the power to channel 1 and is switched off.
 
 Neither key nor interlock can be asked: both are None in `status`. `status` reports a fault if an armed laser is off, or
 has light that the gate does not switch. `pause` is `laser off`, read back; no key is needed afterwards. `disarm` also
 sets channel 2 to 0.
 
-The driver needs echo and prompt off and the usual amount of talk. Opening the laser sets this; `close` puts echo and
-prompt back once the laser is off, since the maker's own program needs the prompt. Levels, `ext`, FINE and talk are left
-as the driver set them; nothing is saved in the laser. If a laser is power-cycled while it is open, it has echo and
-prompt on again: `laser off` still reaches it, but its answers do not count, so open it again.
+The driver needs echo and prompt off, and the setting `talk usual` (how much the laser says). Opening the laser sets
+this; `close` puts echo and prompt back once the laser is off, since the maker's own program needs the prompt. Levels,
+`ext`, FINE and talk are left as the driver set them; nothing is saved in the laser. If a laser is power-cycled while it
+is open, it has echo and prompt on again: `laser off` still reaches it, but its answers cannot be read, so open it
+again.
 """
 
 import logging
@@ -76,8 +77,8 @@ class IbeamFraming:
         """Commands that put echo and prompt back to what they were when the port was opened."""
 
     def prepare(self, port: SerialPort) -> None:
-        """Switch echo and prompt off, whatever state they are in, and note that state. If the laser answers each
-        command with the reply to the one before, it is told to switch off, and `DeviceFault` is raised."""
+        """Switch echo and prompt off, note in `changed` which of them were on, and set `talk usual`. If the laser
+        answers each command with the reply to the one before, it is told to switch off, and `DeviceFault` is raised."""
         said = _say(port, "")
         echoed = _say(port, "echo off")
         found = {"echo on": b"echo off" in echoed, "prom on": _PROMPT in said + echoed}
@@ -91,7 +92,7 @@ class IbeamFraming:
             )
 
     def undo(self, port: SerialPort) -> None:
-        """Put echo and prompt back."""
+        """Put echo and prompt back to what `prepare` found."""
         for command in self.changed:
             _say(port, command)
 
@@ -108,7 +109,8 @@ class IbeamFraming:
         return command.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The lines of the answer in one, without notes (`%SYS-I`); `OK` if there are none. "" if `[OK]` is missing."""
+        """The lines of the answer, joined by "; ", without notes (`%SYS-I`); `OK` if there are none. "" if `[OK]` is
+        missing."""
         said: list[str] = []
         for _ in range(_MOST_LINES):
             text = read_line()
@@ -136,7 +138,8 @@ class IbeamConfig(SerialLaserConfig):
 
 
 class IbeamLaser(SerialLaser):
-    """An iBeam smart with pulse board. `arm` waits up to 10 s for it to come on, or until another thread pauses it."""
+    """An iBeam smart with a pulse board. `arm` waits at most 10 s for the laser to come on; a pause from another thread
+    ends the wait."""
 
     def __init__(self, line: Dialogue, framing: IbeamFraming, name: str, limits: LaserLimits) -> None:
         super().__init__(name, line, limits)
@@ -304,7 +307,8 @@ def _levels(reply: str) -> dict[int, float]:
 
 
 def create(config: IbeamConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> IbeamLaser:
-    """Open the laser and identify it; changes nothing about it but echo, prompt and talk."""
+    """Open the laser and identify it; changes nothing about it but echo, prompt and talk. Raises `DeviceError` if that
+    fails or the laser cannot be used."""
     framing = IbeamFraming()
     identify = partial(_identify, config, framing)
     return open_laser(

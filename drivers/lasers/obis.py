@@ -6,13 +6,13 @@ AllenNeuralDynamics/obis-laser debc218. The limits of the base plate's temperatu
 `HIGH?`, are in `obis.cpp` and in Micro-Manager's `CoherentOBIS.cpp`.
 
 `AM:STAT ON` sent during warm-up is deferred, and light may come minutes later. So `arm` waits until the laser is ready
-and only then sends ON; if the wait ends in any other way it sends OFF. The lasers whose status words are known report
-standby once they can emit, and never ready: either bit counts. In CDRH mode (a safety delay) emission begins 5 s after
-ON. Modes cannot be changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is
-needed to resume. `disarm` does the same and sets the least power. With the handshake (`OK` after each command) off, a
-set command gets no answer at all. So it is read first and never changed, and every setting is read back. The first
-`arm` switches autostart off, so that the laser stays off at its next power-up; `close` puts it back once the laser is
-off.
+and only then sends ON; if the wait ends in any other way it sends OFF. Some lasers report standby once they can emit,
+and never ready; so either bit counts. In CDRH mode (a safety delay) emission begins 5 s after ON. Modes cannot be
+changed while the laser is on. `pause` sends `AM:STAT OFF`, confirmed by the emission bit; no key is needed to resume.
+`disarm` does the same and sets the least power. With the handshake (`OK` after each command) off, a set command gets no
+answer at all. So the driver first reads whether the handshake is on and never changes that, and it reads every setting
+back. The first `arm` switches the prompt off, and also autostart, so that the laser stays off at its next power-up;
+`close` puts both back once the laser is off.
 """
 
 import re
@@ -88,7 +88,8 @@ class ObisFraming:
 
     @property
     def ping(self) -> str:
-        """A query that is always answered: first whether the handshake is on, afterwards the laser's identity."""
+        """A query that is always answered: at first the query for the handshake, afterwards that for the laser's
+        identity."""
         return _HANDSHAKE if self._handshake is None else "*IDN?"
 
     def greets(self, reply: str) -> bool:
@@ -101,7 +102,7 @@ class ObisFraming:
         return True
 
     def asks(self, command: str) -> bool:
-        """Whether it is a query."""
+        """Whether the command is a query."""
         return command.endswith("?")
 
     def encode(self, command: str) -> bytes:
@@ -110,7 +111,8 @@ class ObisFraming:
         return addressed.encode("ascii") + b"\r\n"
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply; "" if its `OK` is missing. Without handshake a set command has none and counts as done."""
+        """The reply to the command, without the `OK` that follows a query's reply; "" if that `OK` is missing. Without
+        handshake a set command gets no reply, and "OK" is returned at once."""
         if not self.asks(command):
             return read_line() if self._handshake else DONE
         reply = read_line()
@@ -120,7 +122,7 @@ class ObisFraming:
         return reply
 
     def refusal(self, reply: str) -> str | None:
-        """The error reply with its meaning; None if the reply is no error."""
+        """The reply with its meaning if it is an error; None if it is no error."""
         error = _ERROR.fullmatch(reply)
         return f"{reply} ({ERRORS.get(-abs(int(error[1])), 'no known number')})" if error is not None else None
 
@@ -360,7 +362,8 @@ class ObisLaser(SerialLaser):
 
 
 def create(config: ObisConfig, surroundings: Surroundings, timing: LineTiming = USUAL_TIMING) -> ObisLaser:
-    """Open the laser and identify it; changes nothing about it."""
+    """Open the laser and identify it; changes nothing about it. Raises `LimitExceeded` if the config's `max_power` is
+    below the least power that the laser can give, and another `DeviceError` if the laser cannot be opened."""
     framing = ObisFraming(config.channel)
     return open_laser("obis", config, surroundings, framing, timing, partial(_identify, config, framing), _off(config))
 

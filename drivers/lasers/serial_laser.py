@@ -1,5 +1,5 @@
-"""The common part of all lasers on a serial line: config with limits, opening, a port that may get lost, serial number,
-and light that ends if a program forgets an armed laser.
+"""The common part of all lasers on a serial line: a config with limits, opening, the check of the serial number, a port
+that may get lost, and an end of the light if a program forgets an armed laser.
 
 `PlainLaser` is a line laser without key or warm-up, whose emission follows `arm` and `pause` at once. Simulated and
 recorded lasers use it.
@@ -114,7 +114,7 @@ class SerialLaser(SerialDevice, LineLaser):
         """Whether pause or disarm was called since arm began, which other threads may do."""
 
     def arm(self, power_w: float) -> None:
-        """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended it."""
+        """See `LineLaser`. Raises `WrongState` if a pause or disarm from another thread ended the arming."""
         self._stopped = False
         before, self._left.may_shine = self._left.may_shine, True
         try:
@@ -140,7 +140,7 @@ class SerialLaser(SerialDevice, LineLaser):
             self._left.may_shine = False
 
     def ask(self, command: str) -> str:
-        """Send a raw command and return the laser's reply, also if it is a refusal.
+        """Send a raw command and return the laser's reply, even if it is a refusal.
 
         Nothing is checked: such a command can make light. It is sent up to three times if no reply comes; then
         `DeviceError` is raised.
@@ -180,12 +180,13 @@ class SerialLaser(SerialDevice, LineLaser):
 
     @property
     def limits(self) -> LaserLimits:
-        """From the laser's least power to the smaller of its own maximum and the config's."""
+        """Powers from the laser's least power to the smaller of its own maximum and the config's `max_power`."""
         return self._limits
 
     def watch_for_end(self, off: bytes) -> None:
-        """Have the laser told to switch off if it is deleted, or Python ends in the normal way, before `close`, or if
-        `close` could not pause it. A failure is only logged. off: bytes that switch it off in any state."""
+        """Have the laser told to switch off if it may shine and this object is deleted, or Python ends in the normal
+        way, before `close`; also if `close` could not pause it. Settings are then put back, too. A failure is only
+        logged. off: bytes that switch the laser off in any state."""
         self._end = partial(_end, self.name, self._line, off, self._left, os.getpid())
         self._forgotten = watch_for_end(self, self._end)
 
@@ -221,11 +222,12 @@ def open_laser(
     prepare: Callable[[SerialPort], None] | None = None,
     undo: Callable[[SerialPort], None] | None = None,
 ) -> _Laser:
-    """Open the port, synchronise with the laser and identify it. Closes the port again if any of it fails.
+    """Open the port, synchronise with the laser and identify it; returns the laser. Closes the port again if any step
+    fails.
 
-    make: name of the make in messages. off: bytes that switch the laser off in any state. prepare: called with the
-    open port first, for a laser whose replies may have another form than `framing` reads. undo: puts back what
-    `prepare` has changed; called if opening fails. identify: makes the laser.
+    make: name of the make in messages. off: bytes that switch the laser off in any state. prepare: called with the open
+    port first, for a laser whose replies may have another form than `framing` reads. undo: puts back what `prepare` has
+    changed; called if opening fails. identify: identifies the laser over the dialogue and returns it.
     Raises `DeviceNotFound` if nothing of that make answers, and what `SerialPort`, `prepare` and `identify` raise.
     """
     port = SerialPort(f"{make} laser", resolve(config.port, surroundings.ports), surroundings.tap, config.baud)
@@ -252,7 +254,8 @@ def open_laser(
 
 
 def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> None:
-    """Raise `DeviceNotFound` if the config names another laser than the one found."""
+    """Raise `DeviceNotFound` if the config names another serial number than `found`. make: name of the make in
+    messages."""
     if config.serial_number not in (None, found):
         raise DeviceNotFound(
             f"{make} laser on {config.port} has serial number {printable(found)}, not {config.serial_number}; correct "
@@ -263,7 +266,8 @@ def require_serial_number(make: str, config: SerialLaserConfig, found: str) -> N
 class PlainLaser(LineLaser):
     """A laser that takes any power up to `max_power_w`.
 
-    emit: called with the power in W that it emits under the gate, whenever that is set.
+    emit: called with the power in watts that the laser emits while the gate is high, each time that this is set; 0
+    while paused.
     """
 
     def __init__(self, name: str, max_power_w: float, emit: Callable[[float], None] | None = None) -> None:

@@ -2,10 +2,10 @@
 
 The laser takes no commands and gives no answers, so all of `status` is what the driver assumes: the laser is on, at the
 config's power, and shines whenever the gate is high. `emission` is therefore always True, `interlock_closed` and
-`key_on` are None, and `armed` only means that a warning was logged when the scan started. `pause`, `disarm` and `close`
-do not change the light, so `gate_only` is True. The only way to end it by software is a low gate: a scan whose sync
-source cannot read its gate back low is refused, as with any laser. Use a laser whose light is off while its TTL input
-is open, or a pull-down.
+`key_on` are None, and `armed` only means that `arm` was called, which logs a warning. `pause`, `disarm` and `close` do
+not change the light, so `gate_only` is True. The only way to end it by software is a low gate: a scan whose sync source
+cannot read its gate back low is refused, as with any laser. Use a laser whose light is off while nothing is connected
+to its TTL input, or add a pull-down resistor.
 """
 
 import logging
@@ -59,15 +59,15 @@ class TtlLaser(LineLaser):
     def open(cls, *, power_w: float, max_power_w: float | None = None) -> "TtlLaser":
         """A laser by itself, without a config file.
 
-        power_w: power that is set at the laser by hand. max_power_w: most power that may ever be sent out; None:
-        `power_w`. Raises `LimitExceeded` for a power that is not possible.
+        power_w: power in watts that is set at the laser by hand. max_power_w: most power in watts that the laser may
+        ever emit; None: `power_w`. Raises `LimitExceeded` for a power that is not possible.
         """
         most_w = power_w if max_power_w is None else max_power_w
         return create(config_of(TtlConfig, power_w=power_w, max_power_w=most_w), alone())
 
     @property
     def identity(self) -> str:
-        """The power that is assumed; there is nothing to ask."""
+        """The name, and the power that is assumed; there is nothing to ask."""
         return f"{self.name} at {format_quantity(self._power_w, 'power')}, set by hand"
 
     @property

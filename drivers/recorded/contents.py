@@ -1,9 +1,9 @@
 """The contents of a recording: which blocks it holds, and where.
 
 The index `frames.idx` has a header of 64 bytes, then a record of 64 bytes for each block, in the order of writing. Each
-record has its own CRC, so a torn or damaged one is recognised and affects no other. A record is used if its CRC is
-right, its place exists, and no other record claims the same bytes. Stretches that no record covers are searched for
-blocks. If the first or last block that the index has for a segment is not there, the index is ignored and all
+record has its own CRC, so a torn or damaged record is recognised and affects no other record. A record is used if its
+CRC is right, its bytes exist, and no other record claims the same bytes. Stretches that no record covers are searched
+for blocks. If the first or last block that the index has for a segment is not there, the index is ignored and all
 segments are searched. `find_blocks` checks no payloads.
 
 The index only tells where to look. The blocks themselves hold everything, so a lost index can be rebuilt from them
@@ -79,7 +79,7 @@ def _signed(record: bytes) -> bytes:
 
 
 def decode_index(buffer: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
-    """Records (n,) of `INDEX_RECORD`, as a view of `buffer` (uint8 (bytes,)), and which of them are sound (n,).
+    """Records (n,) of `INDEX_RECORD`, as a view of `buffer` (uint8 (bytes,)), and which of them are sound, bool (n,).
 
     A torn record at the end is left out. Raises CorruptBlock if `buffer` does not start with a sound index
     header of this version.
@@ -154,7 +154,8 @@ def read_entry(segment: SegmentReader, entry: Any) -> FrameBlock:
 
 
 def payload_crc(segment: SegmentReader, offset: int, length: int) -> int:
-    """CRC of a block's payload, as the trailer states it at the end of its `length` bytes. Raises CorruptBlock."""
+    """CRC of a block's payload, as the trailer states it at the end of its `length` bytes. offset: place of the block
+    in its segment. Raises CorruptBlock if the segment ends before the block does, or cannot be unpacked."""
     raw = segment.at(offset + length - TRAILER_BYTES, TRAILER_BYTES)
     if len(raw) < TRAILER_BYTES:
         raise CorruptBlock(f"{segment.path.name} ends within the block at byte {offset}")
@@ -244,5 +245,5 @@ def round_up_to_page(size: Any) -> Any:
 
 
 def damage_line(segment: SegmentReader, damage: Damage) -> str:
-    """The line that describes a piece of damage to the user."""
+    """The line of text that tells the user of a piece of damage."""
     return f"{segment.path.name}, bytes {damage.offset} to {damage.offset + damage.length}: {damage.reason}"

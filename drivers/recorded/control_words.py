@@ -37,7 +37,8 @@ mirror from wherever it happens to be."""
 
 @dataclass(frozen=True, slots=True)
 class SentCommands:
-    """The commands sent to a rig. commands: by device. scans: point buffers by scan. Each piece has its time."""
+    """The commands sent to a rig. commands: those of each device, by its slot in the rig. scans: the point buffers of
+    each scan, one list for each."""
 
     commands: dict[str, list[TapRecord]]
     scans: list[list[TapRecord]]
@@ -45,8 +46,8 @@ class SentCommands:
     @classmethod
     def of(cls, passed: Iterable[TapRecord]) -> "SentCommands":
         """Sort recorded traffic into commands by device and point buffers by scan. passed: the pieces from the taps, in
-        order of time.
-        """
+        order of time. Without a sync source all point buffers are one scan; with one on the network there are no scans,
+        since its commands are not known."""
         sent: dict[tuple[str, str], list[TapRecord]] = defaultdict(list)
         for one in passed:
             if one.direction == OUT:

@@ -1,4 +1,5 @@
-"""The order of a recording's blocks, and which of them contradict the others. A wrong number costs only one block.
+"""The order of a recording's blocks, and which of them contradict the others. A wrong number in one block costs only
+that block.
 
 Within a run the numbers of blocks, frames, ticks and sweeps never fall. If blocks contradict each other, the consistent
 set with the largest sum of weights is kept. A block weighs more if it agrees with its neighbours and with the index.
@@ -26,8 +27,8 @@ there are more, the device probably counts like that, and all blocks are kept.""
 
 
 def in_order(entries: Entries, told: Entries, problems: list[str], *, folder: bool) -> tuple[Entries, bool]:
-    """The blocks, run after run and with rising numbers, without those that contradict others; and whether they also
-    lie in this order in the files.
+    """The blocks, run after run and with rising numbers, without those that contradict others; and whether they are
+    also in this order in the files.
 
     told: the sound records of the index, ordered by place; they give the order of the runs. problems: a line is
     appended for each reason why blocks are left out. folder: whether the segments are those of a run's folder, where

@@ -41,8 +41,8 @@ _log = logging.getLogger(__name__)
 class RecordedRun:
     """The blocks of one start of the SPAD. Frame numbers count from that start, so the first one need not be 0.
 
-    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: that of a sound block. Up
-    to three sound blocks are read, and the frame size and clock that most of them have are decisive.
+    number: which run of the recording, from 0. entries: (n,) of `INDEX_RECORD`. header: the header of a sound block. Up
+    to three sound blocks are read; it is that of one with the frame size and clock that most of these have.
     """
 
     number: int
@@ -51,17 +51,17 @@ class RecordedRun:
 
     @property
     def first_frame(self) -> int:
-        """Number of its first frame."""
+        """Number of the first recorded frame."""
         return int(self.entries["first_frame"][0])
 
     @property
     def end_frame(self) -> int:
-        """Number of the last frame plus one."""
+        """Number of the last recorded frame plus one."""
         return int(self.entries["first_frame"][-1]) + int(self.entries["n_frames"][-1])
 
     @property
     def frames(self) -> int:
-        """Number of frames recorded."""
+        """Number of frames recorded, lost ones not included."""
         return int(self.entries["n_frames"].sum())
 
     def frame_at(self, seconds: float) -> int:
@@ -79,7 +79,7 @@ class RecordedRun:
         return min(int(self.entries["first_frame"][at]) + behind, next_block)
 
     def gaps(self) -> list[tuple[int, int]]:
-        """(first, last) frame numbers of each gap between two of its blocks."""
+        """Numbers of the first and the last lost frame of each gap between two blocks of the run."""
         begins = self.entries["first_frame"].astype(np.int64)
         ends = begins + self.entries["n_frames"]
         where = np.flatnonzero(begins[1:] > ends[:-1])
@@ -113,7 +113,8 @@ class RunRecording:
     def blocks(
         self, run: RecordedRun, first_frame: int | None = None, end_frame: int | None = None
     ) -> Iterator[FrameBlock]:
-        """The frames of a run from `first_frame` to before `end_frame` (None: all), in the blocks as recorded.
+        """The frames of a run from `first_frame` to before `end_frame` (None: all), in the blocks in which they were
+        recorded. Damaged blocks are left out and listed in `problems`.
 
         The first and the last block are cut to size. Blocks stay valid as long as something refers to them.
         """
@@ -126,7 +127,7 @@ class RunRecording:
 
     def payload_crcs(self) -> list[int] | None:
         """CRC of the payload of every block, as its trailer states it, in the order of `runs`; None if any segment is
-        compressed. Raises CorruptBlock."""
+        compressed. Raises CorruptBlock if a segment ends within a block."""
         if not all(isinstance(segment, PlainSegment) for segment in self._segments.values()):
             return None
         return [
@@ -207,8 +208,7 @@ class RunRecording:
 
 def block_part(block: FrameBlock, first_frame: int, end_frame: int) -> FrameBlock:
     """The frames of a block from `first_frame` to before `end_frame`, as a block; the block itself if that is all of
-    it.
-    """
+    it. At least one of these frames must be in the block."""
     header = block.header
     begin = max(0, first_frame - header.first_frame)
     end = min(block.n_frames, end_frame - header.first_frame)

@@ -1,7 +1,7 @@
 """The segments of a recording: `frames-000000.spb`, or `frames-000000.spb.zst` if it was compressed after the run.
 
-In both cases offsets are those of the plain segment, so one index serves both. A plain segment is mapped into memory
-and its blocks are used where they lie.
+In both cases offsets are those of the plain segment, so one index serves both. A plain segment is mapped into memory,
+and its blocks are used there without a copy.
 
 A compressed segment is in the seekable format of zstd, one zstd frame for each block, so that reading can start
 anywhere. It is a `.zst` file like any other (`zstd -d` gives the plain segment back), with a skippable frame at its end
@@ -69,14 +69,14 @@ class FrameTable:
         return int(self.plain[-1])
 
     def frames_at(self, start: int, end: int) -> range:
-        """Indices of the zstd frames that hold the plain bytes from `start` to `end`."""
+        """Indices of the zstd frames that hold the plain bytes from `start` to before `end`."""
         if start >= min(end, self.size):
             return range(0)
         first = int(np.searchsorted(self.plain, start, "right")) - 1
         return range(first, int(np.searchsorted(self.plain, min(end, self.size), "left")))
 
     def places(self, frame: int) -> tuple[int, int, int, int]:
-        """Begin and end of a frame in the file, then in the plain segment."""
+        """Begin and end of a frame in the file, then in the plain segment, in bytes. frame: its index."""
         return (*self.packed[frame : frame + 2].tolist(), *self.plain[frame : frame + 2].tolist())
 
 
@@ -174,7 +174,7 @@ class PlainSegment:
         return self._bytes[offset : offset + length]
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets."""
+        """Blocks and damage between two offsets. check_payload: whether the CRCs of payloads are checked."""
         return _shifted(self._bytes[start:end], start, check_payload)
 
     def expect(self, offset: int, length: int) -> None:
@@ -184,8 +184,8 @@ class PlainSegment:
             self._map.madvise(mmap.MADV_WILLNEED, begin, min(length + offset - begin, self.size - begin))
 
     def release(self) -> None:
-        """Unmap the file, since Windows neither removes nor renames a mapped one. The segment is of no use then. If
-        something still refers to its bytes, it stays mapped."""
+        """Unmap the file, since Windows neither removes nor renames a mapped one. The segment cannot be read any more.
+        The file stays mapped while something still refers to its bytes."""
         self._bytes = np.empty(0, np.uint8)
         with suppress(BufferError):
             if self._map is not None:
@@ -194,7 +194,8 @@ class PlainSegment:
 
 
 class PackedSegment:
-    """A segment that was compressed after the run, block by block."""
+    """A segment that was compressed after the run, block by block. Raises `DeviceNotFound` if the file cannot be read,
+    and `ProtocolError` if its table is damaged and zstandard is not installed."""
 
     def __init__(self, path: Path, number: int) -> None:
         self.path = path
@@ -212,7 +213,8 @@ class PackedSegment:
         return parts[0] if len(parts) == 1 else np.concatenate([np.empty(0, np.uint8), *parts])
 
     def walk(self, start: int, end: int, *, check_payload: bool) -> Iterator[Placed | Damage]:
-        """Blocks and damage between two offsets. Each compressed frame is searched alone; a broken one is damage."""
+        """Blocks and damage between two offsets. Each compressed frame is searched alone; one that cannot be unpacked
+        is reported as damage."""
         for frame in self._table.frames_at(start, end):
             _, _, begin, stop = self._table.places(frame)
             try:
@@ -242,7 +244,8 @@ SegmentReader = PlainSegment | PackedSegment
 
 
 def open_segments(path: Path) -> list[SegmentReader]:
-    """The segments of a recording's folder in order, or of a single file. Raises `DeviceNotFound` without any."""
+    """The segments of a recording's folder in order, or of a single file. Raises `DeviceNotFound` if there is none, and
+    what `PlainSegment` and `PackedSegment` raise."""
     files = segment_files(path)
     if not files:
         raise DeviceNotFound(f"{path} {NO_SEGMENT}")
@@ -253,7 +256,8 @@ def open_segments(path: Path) -> list[SegmentReader]:
 
 
 def segment_files(path: Path) -> dict[int, Path]:
-    """The segment files by number. If a segment exists both plain and compressed, the plain one is used."""
+    """The segment files of a recording by number; a single file has the number 0. If a segment exists both plain and
+    compressed, the plain one is used."""
     if path.is_file():
         return {0: path}
     found: dict[int, Path] = {}

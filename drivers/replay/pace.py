@@ -3,7 +3,7 @@
 `realtime` plays at the frame clock of the recording, `x4` and `x0.1` at multiples of it, `max` never waits, and `step`
 waits for a call of `Pace.step` before each sweep, or, if there are no scan markers, before each block. Time lost to a
 full ring shifts all later frames and is counted, so that frames then come at their normal pace again and not all at
-once. A run, in this module, is what comes after one start of the SPAD.
+once. A run in this module is one start of the SPAD.
 """
 
 import math
@@ -95,7 +95,8 @@ class Pace:
         return not self._run_on
 
     def most_frames(self, period_s: Fraction) -> float:
-        """Most frames of a block, so that blocks come regularly also at a slow clock; infinite without a speed."""
+        """Most frames of a block, so that blocks come regularly even at a slow clock; infinite without a speed.
+        period_s: frame period as recorded."""
         return math.inf if self.speed is None else max(1.0, _PIECE_S * self.speed / float(period_s))
 
     def start(self) -> None:
@@ -132,8 +133,8 @@ class Pace:
             return True
 
     def hold(self, due_s: float, waited_s: float) -> None:
-        """Note that a block due at `due_s` of recorded time was held up by a full ring for `waited_s`. As far as that
-        made the block late, it shifts all later ones."""
+        """Note that a block due at `due_s` of recorded time was held up by a full ring for `waited_s`. The part of that
+        time by which the block became late shifts all later blocks."""
         if self.speed is None:
             return
         late_ns = self._clock.now_ns() - self._due_ns(due_s, self.speed)

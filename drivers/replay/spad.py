@@ -61,8 +61,8 @@ def recorded_device(recording: Path, slot: str) -> dict[str, Any] | None:
 
 
 def recorded_info(recording: RunRecording) -> SpadInfo:
-    """Properties of the SPAD that took the frames, except that a recording can always wait. Raises `ProtocolError` if
-    the manifest cannot be read or contradicts the frames."""
+    """Properties of the SPAD that took the frames, from the manifest or, without one, as far as the frames tell them.
+    But `can_wait` is always True. Raises `ProtocolError` if the manifest cannot be read or contradicts the frames."""
     noted = recorded_device(recording.path, "spad")
     told = _told_by(recording)
     if noted is None:
@@ -130,8 +130,8 @@ Piece = tuple[FrameBlock, int, int]
 
 
 class Cursor:
-    """The reading position in one `RecordedRun`, which is read to its end or up to frame `n_frames` - 1. For use by one
-    thread at a time.
+    """The reading position in one `RecordedRun`, which is read up to frame `n_frames` - 1, or to its end if that is
+    None. For use by one thread at a time.
 
     by_block: whether each block is a step of `Pace`, because there are no scan markers.
     """
@@ -159,7 +159,8 @@ class Cursor:
         return not self._look_ahead(0)
 
     def gather(self, most: int, *, to_marker: bool) -> list[Piece]:
-        """The next consecutive frames, at most `most`. With `to_marker` the frame of a scan marker is the last one."""
+        """The next consecutive frames, at most `most`, without moving on; an empty list if no frame is left. With
+        `to_marker` the frame of a scan marker is the last one."""
         pieces: list[Piece] = []
         n, index = 0, 0
         while n < most and self._look_ahead(index):
@@ -176,7 +177,7 @@ class Cursor:
         return pieces
 
     def move_on(self, pieces: list[Piece]) -> None:
-        """Move past frames that were gathered."""
+        """Move past the frames of these pieces, which `gather` returned."""
         block, _, end = pieces[-1]
         self.step_due = self._by_block or bool(block.records["marks"][end - 1] & _SCAN)
         self.next_frame = block.header.first_frame + end
@@ -231,7 +232,8 @@ class ReplaySpadConfig(KindConfig):
 
 
 class ReplaySpad(SpadArray):
-    """Plays the starts of a recording one after the other; `configure` goes back to the first."""
+    """Plays the starts of a recording one after the other; `configure` goes back to the first. After the last one,
+    `start` raises `DeviceFault`, or begins again with the first if `loops` is true."""
 
     def __init__(self, config: ReplaySpadConfig, recording: RunRecording, clock: Clock) -> None:
         super().__init__(f"replay of {recording.path.name}")
@@ -254,7 +256,8 @@ class ReplaySpad(SpadArray):
         return self._info
 
     def leave_out(self, runs: Collection[int]) -> None:
-        """Skip the starts with these numbers (`RecordedRun.number`)."""
+        """Skip the starts with these numbers (`RecordedRun.number`). Call it before the first `start`; at least one
+        must be left."""
         self._runs = [run for run in self.recording.runs if run.number not in runs]
 
     def _grab_request(
@@ -421,7 +424,8 @@ class ReplaySpad(SpadArray):
 
 
 def create(config: ReplaySpadConfig, surroundings: Surroundings) -> ReplaySpad:
-    """Open the recording."""
+    """Open the recording that the config names. Raises `DeviceNotFound` if it names none, and what `RunRecording` and
+    `recorded_info` raise."""
     if config.recording is None:
         raise DeviceNotFound("replay: no recording is named; play one with 'rig replay RUN', or set recording")
     return ReplaySpad(config, RunRecording(config.recording), surroundings.clock)

@@ -73,7 +73,7 @@ class RecordedScanner(BeamScanner):
 
 
 class RecordedSync(SyncSource):
-    """A sync source whose program has run already."""
+    """A sync source that plays nothing. From `run` to `abort` it says that it waits for the scan marker."""
 
     _running = False
 

@@ -73,7 +73,8 @@ def colour(high: NDArray[Any]) -> NDArray[np.uint8]:
 
 class PointSource:
     """Gives the points of a run in order: the way from rest at `position` to `end`, then a waveform that begins there,
-    `repeats` times. For use by one thread at a time. `last` is the last command taken, at first `position`."""
+    `repeats` times. For use by one thread at a time. `last` is the last command taken; before the first `take` it is
+    `position`."""
 
     def __init__(
         self,
@@ -111,7 +112,7 @@ class PointSource:
         self._end += 1
 
     def take(self, most: int) -> PointSlice:
-        """The next points, at most `most` of them."""
+        """The next points, at most `most` of them, none once `left` is 0."""
         self._former = self._at, self._before, self.last
         at = np.arange(self._at, min(self._at + most, self._end))
         self._at += len(at)
@@ -146,8 +147,9 @@ class StartTime:
         self._at_s = 0.0
 
     def narrow(self, earliest_s: float, latest_s: float, at_s: float) -> float:
-        """Narrow the bounds by those of an answer that came at `at_s`, after widening them by the clocks' possible
-        drift since the last one. Returns earliest minus latest time in seconds: above 0 they contradict each other."""
+        """Narrow the bounds by those of an answer that came at `at_s`. Before that they are widened by the possible
+        drift of the clocks since the last answer. Returns earliest minus latest time in seconds: above 0 they
+        contradict each other."""
         slack_s, self._at_s = DRIFT * (at_s - self._at_s), at_s
         self.earliest_s = max(self.earliest_s - slack_s, earliest_s)
         self.latest_s = min(self.latest_s + slack_s, latest_s)
@@ -160,10 +162,11 @@ class DacRun(Protocol):
     source: PointSource
 
     def begin(self) -> None:
-        """Send the first points, to be played at once or as soon as a held mirror, clock or trigger allows it."""
+        """Send the first points, to be played at once, or as soon as the points that hold the mirror are over or an
+        external clock or trigger comes."""
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send the other points; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send the other points; returns when the mirror rests. Brakes once another thread sets `stopping`."""
 
     def give_up(self) -> None:
         """Make safe what is left of a run whose `begin` or `feed` has failed. Raises no DeviceError."""
@@ -171,7 +174,7 @@ class DacRun(Protocol):
 
 
 class Dac(Protocol):
-    """An open board. Closing it puts the mirror at the centre, drive 0, in one jump if it stands elsewhere."""
+    """An open board. Closing it puts the mirror at the centre, drive 0, in one jump if it is elsewhere."""
 
     name: str
     identity: str
@@ -219,8 +222,8 @@ class _Motion:
 
 
 class DacScanner(BeamScanner):
-    """One mirror axis. While a waveform is played, a thread feeds the board. If nobody closes the scanner, that is done
-    when the object is deleted or Python ends."""
+    """One mirror axis. While a waveform is played, a thread feeds the board. A scanner that nobody closes is stopped
+    and closed when the object is deleted or Python ends."""
 
     @classmethod
     def at(
@@ -232,8 +235,9 @@ class DacScanner(BeamScanner):
         identify: Callable[[UsbDevice], Dac],
         tap: Tap | None = None,
     ) -> Self:
-        """Open the board at an address on USB. alternates: alternate setting by USB interface. identify: makes the
-        `Dac` of an open device, or raises an error. Raises what `open_device` and `identify` raise."""
+        """Open the board at an address on USB; returns its scanner. wanted: USB ids of the board. alternates: alternate
+        setting by USB interface. identify: makes the `Dac` of an open device, or raises an error. Raises what
+        `open_device` and `identify` raise."""
         usb = open_device(wanted, endpoint.address, alternates, endpoint.usb_backend, tap)
         try:
             return cls(identify(usb), config)

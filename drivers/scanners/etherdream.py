@@ -2,13 +2,13 @@
 
     outputs   X (or Y): mirror. R: lit, i.e. a waveform is being played. G: line marker. B: scan marker. I: backward
 
-The board plays points from a buffer that a thread keeps filled, without frames or seams. Whenever it stops playing
-(the buffer ran empty, a stop, an emergency stop, its Ethernet link lost) it sets all colours to 0 and the mirror to the
+The board plays points from a buffer that a thread keeps filled, without frames or seams. Whenever it stops playing (the
+buffer ran empty, a stop, an emergency stop, its Ethernet link lost) it sets all colours to 0 and the mirror to the
 centre, in one jump. So a mirror that is to rest anywhere else must be held there: after each run a thread sends copies
 of the last point, all dark, at 1 kHz, until the next run or `close`. If the host dies, the points run out within
 `HOLD_S` or `buffer`, and the mirror jumps to the centre in the dark. A board of the second generation stops at once if
-its connection closes. The shutter output is high while the board plays, so also while the mirror is held: it keeps no
-light in.
+its connection closes. The shutter output is high while the board plays, and so also while the mirror is held: it blocks
+no light then.
 
 Whether every point was played exactly once, and at its rate, shows in the replies (`etherdream_stream`). Facts and
 sources: docs/reference/devices/etherdream.md.
@@ -72,10 +72,11 @@ class EtherDreamConfig(GalvoConfig):
 
 
 class EtherDreamDac:
-    """An Ether Dream as a `Dac`. While it is idle, the mirror stands at the centre."""
+    """An Ether Dream as a `Dac`. While the board is idle, the mirror is at the centre."""
 
     def __init__(self, config: EtherDreamConfig, endpoint: Endpoint, clock: Clock, tap: Tap | None = None) -> None:
-        """Connect, identify the board and make it idle. Raises `DeviceError`: `DeviceBusy` if it plays for others."""
+        """Connect, identify the board and make it idle. Raises `DeviceBusy` if the board plays for another program, and
+        another `DeviceError` if it cannot be used."""
         self.name = "Ether Dream"
         self.config = config
         self.clock = clock
@@ -141,8 +142,9 @@ class EtherDreamDac:
         return 0.0
 
     def take_over(self) -> PointStream:
-        """End the thread that holds the mirror, and return its stream, whose queued points hold it for up to `HOLD_S`
-        more. If the board is idle, the stream is a new one. Raises the error that ended the holding, if one did."""
+        """End the thread that holds the mirror, and return its stream. The points queued in that stream hold the mirror
+        for up to `HOLD_S` more. If the board is idle, the stream is a new one. Raises the error that ended the holding,
+        if one did."""
         if (fault := self._let_go()) is not None:
             raise fault
         if self._stream is None:
@@ -223,7 +225,7 @@ class EtherDreamRun(DacRun):
         """Number of points that the stream had sent with the run's last one; None: that was not sent yet."""
 
     def begin(self) -> None:
-        """Send the first points, which play behind those that hold the mirror; at once if the board is idle."""
+        """Send the first points. They play at once if the board is idle, else after the points that hold the mirror."""
         self._stream = self._dac.take_over()
         idle = self._stream.sent == 0
         self._stream.change_rate(self._clock_hz, self._most)
@@ -234,8 +236,8 @@ class EtherDreamRun(DacRun):
             self._stream.begin()
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send the other points; returns when the last one was played; a thread then holds the mirror there. Brakes
-        once `stopping` is set."""
+        """Send the other points; returns when the last one was played. A thread then holds the mirror there. Brakes
+        once another thread sets `stopping`."""
         stopped = False
         while self._end is None or not self._stream.is_played(self._end):
             if not stopped and stopping.is_set():
@@ -274,12 +276,12 @@ class EtherDream(DacScanner):
         **settings: Any,
     ) -> "EtherDream":
         """Open an Ether Dream by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per
-        second.
+        second and per second squared.
 
         port: "HOST" or "HOST:PORT". max_point_rate_hz, buffer_s: the most points per second; the duration of the points
         queued in the board. settings: axis, max_step, rms_duty, command_range, park, as in `EtherDreamConfig`. clock:
-        for emulators. Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board
-        cannot be opened.
+        that of an emulator; None: the system's clock. Raises `LimitExceeded` for a setting that is not possible, and
+        another `DeviceError` if the board cannot be opened.
         """
         config = config_of(
             EtherDreamConfig,

@@ -3,10 +3,11 @@
 Commands go one at a time over TCP, and each gets a reply of 22 bytes with the board's whole status; only `v` gets 32
 bytes of text. Once a second a board broadcasts a datagram with its MAC address, revisions, buffer and highest rate.
 
-A connection that was interrupted in the middle of a command, or that gave no proper reply, is closed for good: else the
-firmware might take the next command for the rest of this one, or a late reply be taken for the next. Unknown commands
-are never sent: they close the connection or stop the board. A rate above the board's highest is refused after one byte,
-and the rest of the command is then read as further commands. Facts and sources: docs/reference/devices/etherdream.md.
+A connection that was interrupted in the middle of a command, or that gave no proper reply, is closed for good.
+Otherwise the firmware might take the next command for the rest of the interrupted one, or the driver might take a late
+reply for the reply to the next command. Unknown commands are never sent: they close the connection or stop the board. A
+rate above the board's highest is refused after one byte, and the rest of the command is then read as further commands.
+Facts and sources: docs/reference/devices/etherdream.md.
 """
 
 import logging
@@ -78,7 +79,7 @@ class Reply:
 
     @classmethod
     def read(cls, bytes_22: bytes) -> "Reply":
-        """The content of a reply."""
+        """The content of a reply of 22 bytes."""
         return cls(*_REPLY.unpack(bytes_22))
 
 
@@ -95,7 +96,7 @@ class Broadcast:
 
     @classmethod
     def read(cls, datagram: bytes) -> "Broadcast | None":
-        """The content of a datagram; None if it has not the length of an Ether Dream's."""
+        """The content of a datagram; None if it does not have the length of an Ether Dream's broadcast."""
         if len(datagram) != _BROADCAST.size:
             return None
         mac, *numbers = _BROADCAST.unpack(datagram)
@@ -104,7 +105,7 @@ class Broadcast:
 
 def broadcasts(wait_s: float = BROADCAST_S, port: int = BROADCAST_PORT) -> Generator[tuple[str, Broadcast], None, None]:
     """The broadcasts that come within `wait_s`, each with its sender's numeric address. Ends early, without an error,
-    if the socket fails, as when another program keeps the port to itself."""
+    if the socket fails, for example if another program keeps the port to itself."""
     ends_at = time.monotonic() + wait_s
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -124,7 +125,8 @@ def listen(host: str) -> Broadcast | None:
 
 
 class EtherDreamLine:
-    """The connection, open from the start. Any thread may call its methods; they take turns."""
+    """The connection to a board, open from its creation until `close` or an error. Any thread may call its methods;
+    they take turns."""
 
     def __init__(self, name: str, endpoint: Endpoint, tap: Tap | None = None) -> None:
         """Connect to "host" or "host:port", and read the status that a board sends to each new client. Raises what
@@ -161,7 +163,8 @@ class EtherDreamLine:
         return Reply.read(self._exchange(command, _REPLY.size, within_s))
 
     def tell(self, command: bytes) -> Reply:
-        """Send one command and return its reply. Raises `CommandRefused` if it is refused, and what `ask` raises."""
+        """Send one command and return its reply. Raises `CommandRefused` if the board refuses it, and what `ask`
+        raises."""
         reply = self.ask(command)
         if reply.code != ACCEPTED:
             raise CommandRefused(
@@ -171,7 +174,8 @@ class EtherDreamLine:
         return reply
 
     def version(self) -> str:
-        """The firmware's name for itself. The oldest firmware does not know the command and closes the connection."""
+        """The firmware's name for itself. The oldest firmware does not know the command and closes the connection.
+        Raises as `ask`."""
         return printable(self._exchange(VERSION, _VERSION_BYTES).split(b"\0")[0].decode("ascii", "replace"))
 
     def close(self) -> None:

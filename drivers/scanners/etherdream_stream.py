@@ -2,8 +2,9 @@
 
 Every reply has the number of points in the buffer and of those played. Their sum must be the number sent: else a point
 was lost or repeated, or another client sends points too. Firmware reads the two numbers one after the other, so the sum
-may be one too high. Besides, the points must be played at the rate that was set: each reply bounds the time of the
-first point at a rate, and the bounds must not contradict each other. If either check fails, `DeviceFault` ends the run.
+may be one too high. Besides, the points must be played at the rate that was set. From each reply follow bounds on the
+time at which the first point at this rate was played, and the bounds of all replies must agree. If either check fails,
+`DeviceFault` ends the run.
 
 Rates change without a pause: `q` queues a rate, and bit 15 of a point's control word makes it that point's rate. A
 point takes floor(24e6 / rate) cycles of 24 MHz: the firmware writes that quotient to the match register of an LPC1758's
@@ -62,7 +63,7 @@ def pps_of(rate_hz: Fraction) -> int:
 
 
 def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-    """The rate nearest to `requested_hz`, between low and high, at which the board can really run."""
+    """The rate nearest to `requested_hz`, between `low_hz` and `high_hz`, at which the board can really run."""
     near = math.floor(requested_hz)
     cycles = round(TIMER_HZ / requested_hz)
     # If any whole number of pps gives n cycles a point, floor(24e6 / n) does.
@@ -89,7 +90,8 @@ class PointStream:
     """The points sent since `PREPARE`. Every reply of the board is checked against them."""
 
     def __init__(self, line: EtherDreamLine, name: str, axis: str, capacity: int, clock: Clock) -> None:
-        """Prepare the board, which is idle. name: in messages; capacity: of its buffer, in points."""
+        """Prepare the board, which must be idle. name: the board's name in messages. axis: "x" or "y", the output of
+        the mirror. capacity: most points that the board's buffer holds. Raises what `EtherDreamLine.tell` raises."""
         self.sent = 0
         self.played = 0
         self._line, self._name, self._axis, self._capacity, self._clock = line, name, axis, capacity, clock
@@ -121,13 +123,14 @@ class PointStream:
         return max(0, min(self._most - at_this_rate, free, MOST_POINTS))
 
     def is_played(self, n: int) -> bool:
-        """Whether the first n points were played, by the board's last reply. A reply whose count is one ahead proves
-        nothing."""
+        """Whether the first n points were played, according to the board's last reply. False after a reply whose sum is
+        one too high: it proves nothing."""
         return self.played >= n and not self._ahead
 
     def send(self, points: PointSlice) -> None:
-        """Append points, no more than there is `room` for; without any, ask how far the board is. Raises `DeviceFault`
-        if points were not played as they should be, and what `EtherDreamLine.ask` raises."""
+        """Append points to the board's buffer, no more than there is `room` for. Without points, only ask how far the
+        board is. Raises `DeviceFault` if points were not played as they should be, and what `EtherDreamLine.ask`
+        raises."""
         n = len(points)
         if not n:
             self.ping()
@@ -141,7 +144,7 @@ class PointStream:
         self.send(PointSlice(np.full(n, command), np.zeros(n, np.uint8), np.zeros(n, bool)))
 
     def begin(self) -> None:
-        """Start to play. Raises as `send`."""
+        """Make the board begin to play. Raises as `send`."""
         self._began = True
         self._moved_s = now_s(self._clock)
         self._exchange(begin(self._first_pps))

@@ -99,7 +99,7 @@ def brake(position: float, velocity_per_s: float, limits: ScannerLimits, rate_hz
     """Commands from `position` (excluded) to rest at a constant deceleration, inside the command range. float64 (n,).
 
     The deceleration exceeds its limit only if the command range leaves too little room. When a waveform within the
-    limits is stopped, this happens only by rounding to whole points, by a factor below 2.
+    limits is stopped, only rounding to whole points can cause that; the excess is then below a factor of 2.
     """
     step = velocity_per_s / rate_hz
     if step == 0:

@@ -13,11 +13,11 @@ powered up or enabled, so STOP is sent when the board is opened. After that, STO
 end; a scan that is stopped ends with a brake ramp.
 
 The device's status tells only when the pending buffer becomes free, but that shows whether the buffers ever ran empty:
-the pending frame began to play between the last status 'full' and the first 'free', which bounds the time at which it
-ends. If its successor arrives after the earliest such time, the mirror may have stood still: the run ends with a fault.
-If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What was
-really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a
-time-out of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
+the pending frame began to play between the last status 'full' and the first 'free', and that bounds the time at which
+it ends. If the next frame arrives after the earliest possible end, the mirror may have stood still: the run ends with a
+fault. If a buffer becomes free before the playing frame can have ended, the device has silently dropped a frame. What
+was really played is known only from the markers in the SPAD's stream. An answer may get lost, so a query has a time-out
+of at most a third of a frame and is repeated; one lost answer in each frame does not end a scan.
 
 The first point of every frame but the first lasts some 2 to 3 us longer than the others (inferred): the firmware writes
 this point's colours over SPI before it starts the timer anew. With frames of 60 ms that is 50 ppm of the duration,
@@ -83,7 +83,7 @@ def pps_of(rate_hz: Fraction) -> int:
 
 
 def nearest_rate(requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-    """The rate nearest to `requested_hz`, between low and high, at which the device can really run."""
+    """The rate nearest to `requested_hz`, between `low_hz` and `high_hz`, at which the device can really run."""
     near = math.floor(requested_hz)
     cycles = round(SYSTICK_HZ / requested_hz)
     # If any whole number of pps gives n cycles a point, floor(112e6 / (n - 1)) does.
@@ -102,11 +102,11 @@ def sendable(points: int) -> bool:
 
 
 def slice_points(left: int, most: int) -> int:
-    """Number of points of the next frame if `left` points are left. most: the largest frame, which must be sendable; so
-    must `left` if it is not above `most`.
+    """Number of points of the next frame if `left` points are left. most: points of the largest frame, which must be
+    `sendable`. If `left` is at most `most`, it must be sendable too.
 
-    If several frames are needed, the last two are of about equal length: a short last but one would end before the last
-    one arrives.
+    If several frames are needed, the last two are of about equal length: a short frame before the last one would end
+    before the last one arrives.
     """
     if left <= most:
         return left
@@ -117,8 +117,8 @@ def slice_points(left: int, most: int) -> int:
 
 
 def encode(points: PointSlice, axis: str, pps: int, flags: int) -> bytes:
-    """The bytes of one frame. R: lit, G: line marker, B: scan marker, I: backward. The unused axis stays at the
-    centre."""
+    """The bytes of one frame. pps: points per second; flags: of the frame (`FLAG_...`). R: lit, G: line marker, B: scan
+    marker, I: backward. The unused axis stays at the centre."""
     centre = np.full(len(points), CENTRE, np.uint16)
     x, y = (points.steps, centre) if axis == "x" else (centre, points.steps)
     frame = np.empty((len(points), 7), np.uint8)
@@ -177,7 +177,8 @@ class HeliosDac:
     """
 
     def __init__(self, config: HeliosConfig, link: UsbDevice, clock: Clock) -> None:
-        """Wait until the firmware is enabled, drop old replies, learn version and name, and centre the mirror."""
+        """Wait until the firmware is enabled, drop old replies, ask for version and name, and centre the mirror. Raises
+        `DeviceTimeout` or `ProtocolError` if the board does not answer properly."""
         self.name = link.label
         self.highest_rate_hz = config.max_point_rate
         self.config = config
@@ -215,7 +216,7 @@ class HeliosDac:
         return 0.0
 
     def free(self, timeout_s: float = _STATUS_S) -> bool | None:
-        """Whether a frame can be sent. None if the device gave no valid status, which also means no."""
+        """Whether a frame can be sent. None if the device gave no valid status; then none may be sent."""
         with self._lock:
             try:
                 if self._out_of_step:
@@ -310,7 +311,7 @@ class HeliosRun(DacRun):
         self._next = self._made() if self.source.left else None
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send all remaining points; returns when the mirror rests. Brakes once another thread sets `stopping`."""
         stopped = False
         while self._next is not None:
             if not stopped and stopping.is_set():
@@ -429,11 +430,13 @@ class Helios(DacScanner):
         usb_backend: object | None = None,
         **settings: Any,
     ) -> "Helios":
-        """Open a Helios by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
+        """Open a Helios by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second and
+        per second squared.
 
         port: as in `GalvoConfig`. max_point_rate_hz, frame_s: the most points per second; the longest frame. settings:
-        axis, max_step, rms_duty, command_range, park, name, as in `HeliosConfig`. clock, usb_backend: for emulators.
-        Raises `LimitExceeded` for a setting that is not possible, other `DeviceError` if the board cannot be opened.
+        axis, max_step, rms_duty, command_range, park, name, as in `HeliosConfig`. clock, usb_backend: those of an
+        emulator; None: the system's clock and libusb. Raises `LimitExceeded` for a setting that is not possible, and
+        another `DeviceError` if the board cannot be opened.
         """
         config = config_of(
             HeliosConfig,

@@ -5,8 +5,8 @@
 
 The board has a ring of samples that a thread keeps filled, without frames or seams. It plays the ring only while its
 output is on; while the output is off, X and Y rest at the centre. So the output is on from the first run until the
-board is closed or halted, and dark points are points whose colours are 0. The colour outputs drive lasers of the
-board's own unless these are unplugged, so all points are dark until the config says where the outputs lead.
+board is closed or halted, and points are made dark by colours of 0. The colour outputs drive lasers of the board's own
+unless these are unplugged, so all points are dark until the config says where the outputs lead.
 
 When the ring runs empty, X and Y keep their values and the colours go to 0. So a run ends with copies of its last
 point, and the mirror rests there. Switching the output off or clearing the ring would put the mirror at the centre in
@@ -14,10 +14,11 @@ one jump. That is done when the board is opened, after a fault, and when it is c
 centre unless a run failed. If the host dies, the ring runs empty within the time that its samples take: the colours go
 dark and the mirror stands still. Nothing else happens then, so the laser's gate must not depend on this board alone.
 
-Whether each sample was played exactly once is judged from the answers to 'how many are queued'. Each answer bounds the
-time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the intervals of all
-answers must have a time in common, within a tolerance. Samples are sent in whole transfers, so that a loss is noticed.
-A run begins with copies of the mirror's resting point, so that a sample lost before the first answer is a copy.
+The driver judges from the answers to 'how many are queued' whether each sample was played exactly once. Each answer
+bounds the time at which the first sample was played, assuming that no sample was lost, repeated or delayed; the
+intervals of all answers must have a time in common, within a tolerance. Samples are sent in whole transfers, so that a
+loss is noticed. A run begins with copies of the mirror's resting point, so that a sample lost before the first answer
+is a copy.
 
 Sources of the protocol: `Wickedlasers/laserdocklib` 51d13bc, lib/src/LaserdockDevice*.cpp, and issue 15 (product string
 `Laserdock`, 12 Mb/s); `Joewodsen/lasercube-v1-ethernet-bridge` 389a35f, README.md (a ring of 768 samples that is not
@@ -120,7 +121,8 @@ class LaserCubeDac:
             )
 
     def point_clock(self, requested_hz: float, low_hz: float, high_hz: float) -> Fraction:
-        """The nearest whole number of Hz, since the device takes nothing else. A run reads it back."""
+        """The nearest whole number of Hz, since the device takes nothing else. A run sets this rate and reads it
+        back."""
         return Fraction(min(max(round(requested_hz), int(low_hz)), int(high_hz)))
 
     def run(self, source: PointSource, clock_hz: Fraction) -> "LaserCubeRun":
@@ -128,7 +130,7 @@ class LaserCubeDac:
         return LaserCubeRun(self, source, int(clock_hz))
 
     def check(self) -> None:
-        """Check that the board answers a query."""
+        """Check that the board answers a query. Raises `DeviceError` if it does not."""
         self.queued()
 
     def halt(self) -> float:
@@ -158,14 +160,14 @@ class LaserCubeDac:
             raise DeviceFault(f"{self.name}: runs at {actual_hz} Hz instead of {rate_hz} Hz; choose another point rate")
 
     def queued(self) -> int:
-        """Number of samples in the ring that were not played yet. Raises `ProtocolError` if it cannot be right."""
+        """Number of samples in the ring that were not played yet. Raises `ProtocolError` for an impossible number."""
         free = self._number(_RING_FREE)
         if free > self.ring_points:
             raise ProtocolError(f"{self.name}: {free} of {self.ring_points} samples free; check the cable")
         return self.ring_points - free
 
     def send(self, samples: bytes) -> None:
-        """Append samples to the ring."""
+        """Append samples of 8 bytes each to the ring, in whole transfers except for the last."""
         step = 8 * SAMPLES_PER_TRANSFER
         for at in range(0, len(samples), step):
             self._link.write(_SAMPLES, samples[at : at + step], _SAMPLES_S)
@@ -251,7 +253,7 @@ class LaserCubeRun(DacRun):
         self._send(self.source.take(self._room(self._queued())))
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send all remaining points; returns when the mirror rests. Brakes once another thread sets `stopping`."""
         stopped = False
         while self.source.left:
             queued = self._queued()
@@ -343,12 +345,13 @@ class LaserCube(DacScanner):
         usb_backend: object | None = None,
         **settings: Any,
     ) -> "LaserCube":
-        """Open a LaserCube by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
+        """Open a LaserCube by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second
+        and per second squared.
 
         port: as in `GalvoConfig`. max_point_rate_hz, buffer_s: the most points per second; the duration of the samples
         queued in the device. settings: axis, max_step, rms_duty, command_range, park, colours, as in `LaserCubeConfig`.
-        clock, usb_backend: for emulators. Raises `LimitExceeded` for a setting that is not possible, other
-        `DeviceError` if the board cannot be opened.
+        clock, usb_backend: those of an emulator; None: the system's clock and libusb. Raises `LimitExceeded` for a
+        setting that is not possible, and another `DeviceError` if the board cannot be opened.
         """
         config = config_of(
             LaserCubeConfig,

@@ -10,16 +10,18 @@ started first, so that sample i of both leaves with the same edge. The run is fe
 the card says it has generated. If the buffer runs dry, the card stops with an error, never with old points.
 
 After its points a run goes on with copies of the last one, markers low, until the card has generated the last point;
-then the tasks are stopped in the middle of the copies. A stopped output keeps its last level, and so does a cleared one
-and one whose buffer ran dry. So every way out of a run takes the markers low. If the host dies or the connection to the
-server is lost, that fails and they stay as they are: the laser's gate must not depend on this card alone.
+then the tasks are stopped in the middle of the copies. A stopped output keeps its last level, and so does one whose
+task is cleared or whose buffer ran dry. So every way out of a run takes the markers low. If the host dies or the
+connection to the server is lost, that fails and they stay as they are: the laser's gate must not depend on this card
+alone.
 
 `start` first turns the mirror to the first point, by the card's own clock, then arms the waveform with the config's
-clock, triggers and exports. Its point 0 is the first sample clock after the start trigger, with counters the second.
+clock, triggers and exports. Point 0 of the waveform begins with the first sample clock after the start trigger; with
+counters, with the second.
 
 An output can be written, not read. Most cards with analogue inputs measure it on an internal channel, though. Such a
-card brings a mirror that stands elsewhere to the centre along a ramp when it is opened, and leaves it where it is after
-a failed run. Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
+card brings a mirror that is elsewhere to the centre along a ramp when it is opened, and leaves it where it is after a
+failed run. Other cards jump to the centre in both cases. Facts and sources: docs/reference/devices/nidaq.md.
 """
 
 import logging
@@ -134,25 +136,27 @@ class NidaqConfig(GalvoConfig):
 
     @property
     def outputs(self) -> dict[int, str]:
-        """Line or counter by marker bit."""
+        """Name of the line or counter by marker bit, such as `MARKER_LINE`; markers that are not wired are left out."""
         return {bit: name for bit, key in _KEYS.items() if (name := getattr(self, key)) is not None}
 
     @property
     def lines(self) -> dict[int, int]:
-        """Number of the line by marker bit."""
+        """Number of the line on port 0 by marker bit, for the markers that are lines."""
         return {bit: int(name[len(_LINE) :]) for bit, name in self.outputs.items() if name.startswith(_LINE)}
 
     @property
     def counters(self) -> dict[int, str]:
-        """Counter by marker bit."""
+        """Name of the counter by marker bit, for the markers that are made by counters."""
         return {bit: name for bit, name in self.outputs.items() if not name.startswith(_LINE)}
 
 
 class NidaqDac:
-    """An NI card as a `Dac`. It has tasks only while something is set, written or measured; `release` ends a run's."""
+    """An NI card as a `Dac`. It has tasks only while something is set, written or measured; `release` ends those of a
+    run."""
 
     def __init__(self, config: NidaqConfig, address: str, clock: Clock) -> None:
-        """Look the card up. Moves nothing. Raises `LimitExceeded` if the config asks for more than it can do."""
+        """Look the card up. Moves nothing. Raises `LimitExceeded` if the config asks for more than the card can do, and
+        what `NiCard` raises."""
         self.config, self.clock = config, clock
         self.card = NiCard(address)
         self.name = self.card.name
@@ -213,13 +217,15 @@ class NidaqDac:
         return NidaqRun(self, source, clock_hz)
 
     def check(self) -> None:
-        """Ask the card for its level or, where that cannot be measured, NI-DAQmx for its serial number."""
+        """Ask the card for its level or, where that cannot be measured, NI-DAQmx for its serial number. Raises
+        `DeviceError` if that fails."""
         if self.level() is None:
             with self.card.errors():
                 _ = self.card.properties.serial_num
 
     def level(self) -> float | None:
-        """The drive at the mirror's output, as the card measures it; None if it cannot, or cannot at present."""
+        """The drive at the mirror's output, as the card measures it; None if the card cannot measure it, or cannot at
+        present."""
         if self._simulated:  # NI's simulated cards measure a sine wave
             return None
         try:
@@ -242,7 +248,8 @@ class NidaqDac:
         return drive
 
     def dark(self) -> None:
-        """Write all marker lines low, and make the counters idle, which is low. Cleared ones would keep their level."""
+        """Write all marker lines low, and make the counters idle, which is low. Without this, an output whose task is
+        cleared keeps its level."""
         if self.lines:
             with self.card.errors(), self.card.task() as task:
                 self.add_lines(task)
@@ -254,7 +261,8 @@ class NidaqDac:
                 task.start()
 
     def add_counter(self, task: Any, name: str, delay: int, low: int, high: int) -> None:
-        """Add a counter to a task: `delay` edges of the mirror's clock, then pulses of `high` edges, `low` between."""
+        """Add the counter `name` to a task. It waits for `delay` edges of the mirror's sample clock, then makes pulses
+        that are high for `high` edges and low for `low` edges."""
         task.co_channels.add_co_pulse_chan_ticks(
             f"{self.card.device}/{name}",
             self.card.terminal(self.config.counted_at or "ao/SampleClock"),
@@ -298,9 +306,10 @@ class NidaqDac:
 
 def pulse_train(high: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
     """The pulses that a counter has to make for a marker that is high at these points, bool (points,): begin of the
-    first one, width and period, in points, and their number. None: it is never high.
+    first pulse, width and period, in points, and the number of pulses. None: the marker is never high.
 
-    A counter makes equal pulses at equal distances, 2 points or more high and low. Raises ValueError for others.
+    A counter makes equal pulses at equal distances, 2 points or more high and 2 or more low. Raises ValueError for a
+    marker that needs others.
     """
     if not high.any():
         return None
@@ -336,7 +345,7 @@ class NidaqRun(DacRun):
             self._begin()
 
     def feed(self, stopping: threading.Event) -> None:
-        """Send all remaining points; returns when the mirror rests. Brakes once `stopping` is set."""
+        """Send all remaining points; returns when the mirror rests. Brakes once another thread sets `stopping`."""
         # A call that is later than this leaves too little time to take the gate low before the points run dry.
         with self._card.errors(), self._card.patient(_PATIENT * self._dac.config.buffer):
             self._feed(stopping)
@@ -482,12 +491,13 @@ class Nidaq(DacScanner):
         host_clock: Clock | None = None,
         **settings: Any,
     ) -> "Nidaq":
-        """Open an NI card by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second.
+        """Open an NI card by itself. Commands are drives from -1 to 1, so the galvo's limits are in drive per second
+        and per second squared.
 
         port: as in `NidaqConfig`. full_scale_v: the voltage at drive 1. max_point_rate_hz, buffer_s: the most points
-        per second; the duration of the samples queued ahead. settings: channel, markers, clock, start and all others of
-        `NidaqConfig`. host_clock: for emulators. Raises `LimitExceeded` for a setting that is not possible, other
-        `DeviceError` if the card cannot be opened.
+        per second; the duration of the samples queued ahead. settings: the other fields of `NidaqConfig`, such as
+        channel, clock and start. host_clock: that of an emulator; None: the system's clock. Raises `LimitExceeded` for
+        a setting that is not possible, and another `DeviceError` if the card cannot be opened.
         """
         config = config_of(
             NidaqConfig,

@@ -66,7 +66,8 @@ Value = TypeVar("Value")
 
 
 def attached_cards() -> list[tuple[str, str]]:
-    """Name and model of each card that NI-DAQmx on this computer knows; none without the package or NI-DAQmx."""
+    """Name and model of each card that NI-DAQmx on this computer knows; an empty list without the package nidaqmx or
+    NI-DAQmx."""
     try:
         system, errors = import_module("nidaqmx.system"), import_module("nidaqmx.errors")
     except ImportError:
@@ -78,12 +79,14 @@ def attached_cards() -> list[tuple[str, str]]:
 
 
 class NiCard:
-    """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread."""
+    """A card: tasks on it, questions to it, and its sample clocks. May be called from any thread. Methods that use
+    tasks raise nidaqmx's own errors: call them within `errors`."""
 
     def __init__(self, address: str) -> None:
         """Load nidaqmx, and connect to the server if the address, "Dev1" or "[grpc=]HOST:PORT/Dev1", names one.
 
-        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer, and as `errors`.
+        Raises `ProtocolError` if a package is missing, `DeviceNotFound` if the server does not answer, and the errors
+        that `errors` makes of nidaqmx's.
         """
         server, _, self.device = address.removeprefix(GRPC_PREFIX).rpartition("/")
         self.name = f"nidaq {self.device}"
@@ -113,7 +116,7 @@ class NiCard:
             self._limit_s = self._call_s
 
     def limit_waits(self) -> None:
-        """Wait no longer for the server, from now on, than a close may take."""
+        """From now on, wait for the server only as long as is allowed while a card is closed."""
         self._call_s, self._late_s = _CLOSE_S, _CLOSE_LATE_S
         self._limit_s = min(self._limit_s, _CLOSE_S)
 
@@ -141,7 +144,7 @@ class NiCard:
 
     @contextmanager
     def task(self) -> Iterator[Any]:
-        """A new `nidaqmx.Task`, which is cleared at the end. That also ends what it does."""
+        """A new `nidaqmx.Task`, which is cleared at the end of the context. That also ends what the task does."""
         task = self.new_task()
         try:
             yield task
@@ -149,8 +152,8 @@ class NiCard:
             self._clear(task)
 
     def clear(self, keep: int = 0) -> None:
-        """Clear all but the `keep` oldest tasks, latest first; then raise the last error. An interrupt leaves the
-        rest."""
+        """Clear all but the `keep` oldest tasks, latest first. If clearing some of them failed, raises the last error
+        afterwards. An interrupt (Ctrl-C) leaves the remaining tasks as they are."""
         failed: Exception | None = None
         while len(self._tasks) > keep:
             try:
@@ -176,7 +179,7 @@ class NiCard:
         return name if name.startswith("/") else f"/{self.device}/{name}"
 
     def property_of(self, ask: Callable[[], Value]) -> Value | None:
-        """The answer to a question about a property; None if this card does not have it."""
+        """The answer of `ask`, which reads a property; None if this card does not have that property."""
         try:
             return ask()
         except self._ni.DaqError as error:

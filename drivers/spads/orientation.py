@@ -28,12 +28,13 @@ pixels across the diagonal."""
 
 
 def turned_size(width: int, height: int, turn_deg: QuarterTurn) -> tuple[int, int]:
-    """Width and height after the turn."""
+    """Width and height of frames of width x height pixels after the turn."""
     return (height, width) if turn_deg in (90, 270) else (width, height)
 
 
 def turn_packed(bits: NDArray[np.uint8], turn_deg: QuarterTurn, out: NDArray[np.uint8]) -> None:
-    """Write `bits`, uint8 (n, height, width / 8), turned counter-clockwise, to `out`, (n, new height, new width / 8).
+    """Write `bits`, uint8 (n, height, width / 8), turned counter-clockwise by `turn_deg`, to `out`, uint8 (n, new
+    height, new width / 8).
 
     Most significant bit = leftmost pixel. Width and height are multiples of 8. `out` must not overlap `bits`.
     """

@@ -89,16 +89,16 @@ class Spad512sRun:
 
     @property
     def ends(self) -> bool:
-        """Whether the next block is the last."""
+        """Whether the next block is the last one of the run."""
         return self.next_frame + self.next_n == self.n_frames
 
     def receive(self, ends_at: float, timeout_s: float, stopped: Callable[[], bool]) -> NDArray[np.uint8] | None:
         """Pixels of the next block, uint8 (n * frame bytes,), once `DONE` or `GUARD_BYTES` have followed; None if
         stopped.
 
-        A call continues where the last one ended. At `ends_at` (of `time.monotonic`) the block is cut short after the
-        frames that are here; raises `DeviceTimeout` if none are. Raises `DeviceFault` with the device's own words, or
-        `ProtocolError`.
+        A call continues where the last one ended. stopped: returns True once the run is to be stopped. timeout_s: named
+        in the error's message. At `ends_at` (of `time.monotonic`) the block is cut short after the frames that are
+        here; raises `DeviceTimeout` if none are. Raises `DeviceFault` with the device's own words, or `ProtocolError`.
         """
         wanted = self.next_n * self._frame_bytes + (len(DONE) if self.ends else GUARD_BYTES)
         while self._got < wanted:
@@ -228,7 +228,8 @@ class Spad512sConfig(KindConfig):
 
 
 class Spad512s(SpadArray):
-    """A connected SPAD512S."""
+    """A connected SPAD512S. Raises what `Spad512sLine.connect` raises, and `DeviceFault` for a 1M sensor without
+    `max_frame_rate`."""
 
     def __init__(
         self, config: Spad512sConfig, endpoint: Endpoint, deadlines: Deadlines | None = None, tap: Tap | None = None
@@ -279,8 +280,8 @@ class Spad512s(SpadArray):
         """Connect to a SPAD512S by itself, without a config file.
 
         port, settings (rotation, trigger, burst_frames, width_in_command): as in `Spad512sConfig`. max_frame_rate_hz:
-        None for that of the 512 x 512 sensor. surroundings: clock, tap and emulated ports; None: the system's clock and
-        real ports only. Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the
+        None means that of the 512 x 512 sensor. surroundings: clock, tap and emulated ports; None: the system's clock
+        and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the
         device cannot be reached.
         """
         config = config_of(Spad512sConfig, port=port, max_frame_rate_hz=max_frame_rate_hz, **settings)
@@ -293,7 +294,7 @@ class Spad512s(SpadArray):
 
     @property
     def identity(self) -> str:
-        """Serial numbers and versions."""
+        """The device's name, flavour, serial numbers and versions."""
         return f"{self.name}: {self._identity}"
 
     def _do_health(self) -> SpadHealth:

@@ -102,12 +102,14 @@ class Spad512sLine:
             stream.close()
 
     def tell(self, command: str) -> None:
-        """Send a command whose answer is pixels, or that has none."""
+        """Send a command whose answer is pixels, or that has none. Closes the connection if the program takes
+        nothing."""
         with self._given_up_on_silence():
             self._send(self._open(), command)
 
     def ask(self, command: str) -> str:
-        """Send a command and return its answer. Raises DeviceFault for an ERROR, DeviceTimeout if none comes."""
+        """Send a command and return its answer. Raises DeviceFault for an ERROR. If no answer comes, raises
+        DeviceTimeout and closes the connection."""
         answer_s = self._deadlines.answer_s
         with self._given_up_on_silence():
             stream = self._open()

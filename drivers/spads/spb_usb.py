@@ -1,8 +1,9 @@
 """A SPAD array on USB that speaks SPB1 (docs/reference/spb1-usb.md), behind a Cypress FX3 or an FT601.
 
-The protocol is this project's own proposal. Opening checks product string, identity registers and, if there is one, a
-test pattern. The device counts and time-stamps frames itself, moves its windows by the markers, and takes its gate low
-if no PING comes for `heartbeat`. `fill` sends pings, between two blocks, so the light ends if the source thread hangs.
+The protocol is this project's own proposal. Opening the device checks its product string, its identity registers and,
+if it has one, its test pattern. The device counts and time-stamps frames itself, moves its windows by the markers, and
+takes its gate low if no PING comes for `heartbeat`. `fill` sends pings, between two blocks, so the light ends if the
+source thread hangs.
 """
 
 import logging
@@ -75,7 +76,8 @@ class SpbUsb(SpadArray):
     """An SPB1 SPAD over an open link."""
 
     def __init__(self, config: SpbUsbConfig, link: BulkLink, clock: Clock, tap: Tap | None = None) -> None:
-        """Check the device's identity and test pattern. clock: for deadlines; the link must wait on it too."""
+        """Take over `link`, which is closed with the device, and check the device's identity and test pattern. clock:
+        for deadlines; the link must wait on it too. Closes the link and raises `DeviceError` if a check fails."""
         super().__init__(link.label)
         self._config = config
         self._link = link
@@ -297,7 +299,8 @@ class SpbUsb(SpadArray):
 
 
 def open_link(config: SpbUsbConfig, endpoint: Endpoint) -> BulkLink:
-    """The link to the device at an endpoint. An emulator's own backend supports plain reads only."""
+    """The link to the device at an endpoint. An emulator's own backend supports plain reads only. Raises `DeviceError`
+    if the device cannot be found or opened."""
     wiring = WIRINGS[config.chip]
     listing = find_device(wiring.usb, endpoint.address, endpoint.usb_backend)
     queued = config.reads == "queued" and endpoint.usb_backend is None

@@ -51,9 +51,8 @@ class SensorIdentity:
 
 
 def identify(control: ControlChannel, name: str) -> SensorIdentity:
-    """Read the identity registers. Raises `DeviceNotFound` if the device does not speak SPB1, `DeviceFault` for another
-    version, `ProtocolError` for impossible values.
-    """
+    """End a run that an earlier program left behind, and read the identity registers. Raises `DeviceNotFound` if the
+    device does not speak SPB1, `DeviceFault` for another version, `ProtocolError` for impossible values."""
     # A program that died may have left a run behind, which would drown the answers.
     control.forget_run()
     try:
@@ -114,7 +113,7 @@ class RunSetup:
     window: WindowTable | None = None
 
     def write(self, control: ControlChannel) -> None:
-        """Write the registers."""
+        """Write the registers, and the window table if there is one."""
         control.write_all(
             (
                 (Register.HEARTBEAT_MS, round(self.heartbeat_s * 1000)),
@@ -138,7 +137,7 @@ class RunSetup:
 
 
 def write_length(control: ControlChannel, n_frames: int | None) -> None:
-    """Make the run end after `n_frames` frames; None: only when it is told to end."""
+    """Make the run end after `n_frames` frames; None: the run ends only when the device is told so."""
     n = n_frames or 0
     control.write_all(((Register.N_FRAMES, n & 0xFFFFFFFF), (Register.N_FRAMES + 4, n >> 32)))
 
@@ -167,7 +166,8 @@ def require_windows(identity: SensorIdentity, window: WindowTable, name: str) ->
 
 
 def require_order(control: ControlChannel, identity: SensorIdentity, heartbeat_s: float) -> None:
-    """Raise `ProtocolError` if bits or rows of the test pattern come in a wrong order. Skipped without a pattern."""
+    """Play the test pattern; raises `ProtocolError` if its bits or rows come in a wrong order. Does nothing if the
+    device has no test pattern."""
     if Feature.TEST_PATTERN not in identity.features:
         return
     info, name, period = identity.info, control.link.label, identity.min_period_ticks
@@ -224,8 +224,8 @@ class Wiring:
     """Whether the chip streams only within a session that is opened by commands."""
 
     def open_session(self, link: BulkLink) -> None:
-        """For an FT601: clear what an unclosed session left behind, then let it stream, each by the two commands that
-        public clients send for it. May raise `ProtocolError`."""
+        """Open the session of an FT601: two commands clear what an unclosed session left behind, two more let the chip
+        stream, as public clients do it. Does nothing for another chip. May raise `ProtocolError`."""
         if not self.has_session:
             return
         found = len(link.control_in(0xC0, _CONFIG_REQUEST, 1, 0, _CONFIG_BYTES, 1.0))
@@ -235,7 +235,8 @@ class Wiring:
             self._tell(link, command)
 
     def close_session(self, link: BulkLink) -> None:
-        """End an FT601's session. A chip whose session is not ended answers nobody until it is plugged in again."""
+        """End an FT601's session; does nothing for another chip. An FT601 whose session is not ended answers nobody
+        until it is plugged in again."""
         if self.has_session:
             for command in (_ABORT, _CLEAR):
                 self._tell(link, command)

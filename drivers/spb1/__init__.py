@@ -1,7 +1,7 @@
 """SPB1 blocks, the zero-copy form of frames on the wire and on disk: layout, writing, reading, walking a stream.
 
 Input: frames to be written, or bytes from a device or a file. Output: sealed blocks; or sound blocks as views of these
-bytes, and a `Damage` where there is none. `control` and `receiver` serve live devices.
+bytes, and a `Damage` for each piece of them that holds no sound block. `control` and `receiver` serve live devices.
 """
 
 from drivers.spb1.layout import ALIGN as ALIGN

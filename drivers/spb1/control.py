@@ -205,9 +205,9 @@ TAP_PORT = "control"
 class ControlChannel:
     """The control plane over a link. For use by one thread at a time.
 
-    ack_in: the endpoint of acknowledgements, None if they come as blocks, which cannot be read while a run streams.
-    tap: notes commands and acknowledgements, but not what a run left in front of them. Calls raise `DeviceTimeout` if
-    the device does not acknowledge and `DeviceFault` if it refuses.
+    ack_in: the endpoint of acknowledgements, None if they come as control blocks in the stream; these cannot be read
+    during a run. tap: notes commands and acknowledgements, but not what a run left in front of them. Calls raise
+    `DeviceTimeout` if the device does not acknowledge and `DeviceFault` if it refuses.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class ControlChannel:
         return low | high << 32
 
     def read_text(self, register: int, size: int) -> str:
-        """The text in registers that hold it padded with zeros."""
+        """The text in the registers from `register` on, which hold it in `size` bytes, padded with zeros."""
         words = self.read_all([register + at for at in range(0, size, 4)])
         raw = b"".join(word.to_bytes(4, "little") for word in words)
         return printable(raw.split(b"\0")[0].decode("utf-8", "replace").strip())
@@ -254,11 +254,11 @@ class ControlChannel:
         self._ask([(Op.WRITE, register, value) for register, value in values])
 
     def send(self, op: Op, value: int = 0) -> Ack:
-        """Send one command. Raises `DeviceFault` if the device refuses it."""
+        """Send one command and return its acknowledgement. Raises `DeviceFault` if the device refuses it."""
         return self._ask([(op, 0, value)])[0]
 
     def send_in_run(self, op: Op, value: int = 0) -> None:
-        """Send one command while the stream runs. Waits for the answer unless it comes in the stream."""
+        """Send one command while the stream runs. Waits for the acknowledgement, unless that comes in the stream."""
         if self.ack_in is not None:
             self.send(op, value)
         else:
@@ -270,7 +270,8 @@ class ControlChannel:
         self.drain()
 
     def drain(self) -> None:
-        """Read and drop what the stream still sends. Raises `ProtocolError` if it does not end."""
+        """Read and drop what the stream still sends. Raises `ProtocolError` if the stream does not end within a
+        second."""
         ends_at = now_s(self.clock) + _DRAIN_S
         while now_s(self.clock) < ends_at:
             try:

@@ -91,7 +91,8 @@ class BlockLayout:
 
 
 def frames_per_block(stride: int, width: int, height: int) -> int:
-    """Number of frames that fit into a stride. Raises ValueError if the stride is bad or holds no frame."""
+    """Number of frames that fit into a stride. Raises ValueError if the stride is no positive multiple of `ALIGN` or
+    holds no frame."""
     check_stride(stride)
     one = BlockLayout(1, width, height)
     room = stride - HEADER_BYTES - TRAILER_BYTES
@@ -116,7 +117,8 @@ def block_views(buffer: NDArray[np.uint8], layout: BlockLayout) -> tuple[NDArray
 def views_at(
     buffer: NDArray[np.uint8], layout: BlockLayout, records_offset: int, pixels_offset: int
 ) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
-    """Records and bits of `layout` as views at given offsets, which are not the usual ones if a header is longer."""
+    """Records and bits of `layout` as views of `buffer` at the given offsets. These differ from those of `layout` if a
+    block's header is longer than `HEADER_BYTES`."""
     n = layout.n_frames
     records: NDArray[np.void] = buffer[records_offset : records_offset + n * FRAME_RECORD.itemsize].view(FRAME_RECORD)
     pixels = buffer[pixels_offset : pixels_offset + n * layout.frame_bytes]
@@ -160,8 +162,8 @@ def seal_block(
 
 
 def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payload: bytes) -> None:
-    """Write a control block (`REGISTER_ACK`, `IDLE`), which has no frames. buffer: uint8 (stride,), written
-    completely."""
+    """Write a control block, which has no frames. payload_type: `REGISTER_ACK` or `IDLE`. buffer: uint8 (stride,),
+    written completely."""
     end = HEADER_BYTES + len(payload)
     raw = buffer.data
     sizes = len(payload), round_up(end, PIXELS_ALIGN)
@@ -177,8 +179,8 @@ def seal_control(buffer: NDArray[np.uint8], payload_type: int, run_id: int, payl
 def block_parts(block: FrameBlock) -> tuple[memoryview, ...]:
     """The bytes of a block in order, for a file, with the payload's CRC and zeros up to the next multiple of `ALIGN`.
 
-    Records and pixels are views of the block's memory, where that is contiguous, and valid as long as it is. Reads
-    every byte, without the interpreter's lock. Raises ValueError for headers that `seal_block` refuses.
+    Records and pixels are views of the block's memory if that is contiguous, and valid as long as that memory is. Reads
+    every byte, without the interpreter's lock. Raises ValueError for a header that `seal_block` refuses.
     """
     header = block.header
     layout = BlockLayout(block.n_frames, header.width, header.height)

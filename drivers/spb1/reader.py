@@ -1,8 +1,8 @@
 """Reading SPB1 blocks: a single one in its memory, or a stream of them that may be damaged.
 
 Header and trailer are always checked in full. The payload's CRC is checked on request, since it reads every byte, which
-at full rate would cost a live stream much of a core. A block that is found damaged is never passed on and always
-reported.
+for a live stream at full rate would take much of a processor core. A block that is found damaged is never passed on and
+always reported.
 """
 
 from collections.abc import Iterator
@@ -241,7 +241,8 @@ def walk_blocks(buffer: NDArray[np.uint8], stride: int | None, *, check_payload:
     stride: bytes from block to block. None if it is unknown or changes: then each block ends at its own size, and zeros
     up to the next one are padding. After damage, reading resumes at the next header with the right CRC on a multiple of
     `ALIGN`. A block whose number does not rise within its run counts as damage: it was sent or written twice. Control
-    blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not support.
+    blocks are skipped. Raises `UnsupportedBlock` at a block of a kind that this reader does not support, and ValueError
+    for a bad stride.
     """
     last: FrameBlock | None = None
     for item in walk_placed(buffer, stride, check_payload=check_payload):
@@ -270,9 +271,8 @@ class Placed:
 
 
 def walk_placed(buffer: NDArray[np.uint8], stride: int | None, *, check_payload: bool) -> Iterator[Placed | Damage]:
-    """Blocks with their places, and damage, in the order in which they lie. Block numbers may fall or repeat.
-    Unsupported blocks are reported as damage.
-    """
+    """Blocks with their places, and damage, in the order of their places. Block numbers may fall or repeat. Unsupported
+    blocks are reported as damage. stride: as in `walk_blocks`."""
     if stride is not None:
         check_stride(stride)
     offset = 0

@@ -1,9 +1,10 @@
 """The receiving end of a live SPB1 stream (docs/reference/spb1-usb.md): queued reads straight into ring slots.
 
-Reads of one stride each are kept in flight, into slots claimed in order. A block is used where it lies, or refused and
-counted. After damage, the next sound header on a multiple of 1024 bytes shows where blocks begin, and one short read
-aligns the reads with the blocks again. If the ring has no free slot, reads go on into spare memory so that the device's
-FIFO does not overflow. Such a block is copied into a slot if one has become free meanwhile, else dropped and counted.
+Reads of one stride each are kept in flight, into slots claimed in order. A block is used in place, without a copy, or
+refused and counted. After damage, the next sound header on a multiple of 1024 bytes shows where blocks begin, and one
+short read aligns the reads with the blocks again. If the ring has no free slot, reads go on into spare memory so that
+the device's FIFO does not overflow. Such a block is copied into a slot if one has become free meanwhile, else dropped
+and counted.
 """
 
 import logging
@@ -37,7 +38,7 @@ _ROOMY_RING = 8
 
 @dataclass(frozen=True, slots=True)
 class Armed:
-    """Properties that the blocks of a run must have. n_frames: of the whole run; None if its end is not set.
+    """Properties that the blocks of a run must have. n_frames: frames of the whole run; None: it has no set end.
     check_payload: whether CRCs of payloads are checked."""
 
     run_id: int
@@ -103,8 +104,8 @@ class BlockReceiver:
         self._row_px = 8 * packed_row_bytes(armed.sensor_width)
 
     def take(self, ring: BlockRing, timeout_s: float) -> ReadOutcome:
-        """Wait for the next read and process it. Raises the link's errors, `UnsupportedBlock`, and, after counting the
-        frames, what `ring.mark_overflow` raises."""
+        """Wait for the next read and process it. Raises the link's errors, `UnsupportedBlock`, and what
+        `ring.mark_overflow` raises; the frames are counted before that."""
         self._ring = ring
         self._top_up(ring)
         reaped = self._link.reap(timeout_s)
@@ -117,7 +118,8 @@ class BlockReceiver:
         return self._judge(item, item.buffer[: reaped[1]])
 
     def drain(self, timeout_s: float) -> bool:
-        """Read on without publishing, for at most one wait of `timeout_s`. True once the last block has come."""
+        """Read one more block and drop it, waiting at most `timeout_s`; its frames count as exposed. Returns whether
+        the run's last block has come."""
         if not self._items:
             self._submit(self._spare(), slot=False)
         reaped = self._link.reap(timeout_s)
@@ -133,7 +135,7 @@ class BlockReceiver:
         return self.ended
 
     def close(self) -> None:
-        """Cancel the reads in flight and give their slots back."""
+        """Cancel the reads in flight and give their slots back to the ring."""
         self._link.cancel()
         if self._held is not None:
             self._items.append(_Item(self._held, slot=True))

@@ -1,4 +1,4 @@
-"""The base of boards that play patterns: pins of the user's choice, and outputs that go low if a start fails, and if
+"""The base of boards that play patterns: pins of the user's choice, and outputs that go low if a start fails or if
 nobody closes the board."""
 
 import logging
@@ -28,11 +28,11 @@ class OutputPins:
     marker: int = 2
 
     def levels(self, outputs: int) -> int:
-        """Levels of the pins, bit by pin, for an OR of `OUT_*`."""
+        """Levels of the pins, one bit for each pin, for an OR of `OUT_*`."""
         return sum(1 << pin for output, pin in self._pairs if outputs & output)
 
     def outputs(self, levels: int) -> int:
-        """The OR of those `OUT_*` whose pins are high in `levels`, bit by pin."""
+        """The OR of those `OUT_*` whose pins are high. levels: one bit for each pin."""
         return sum(output for output, pin in self._pairs if levels >> pin & 1)
 
     @property
@@ -64,7 +64,8 @@ class BoardConfig(KindConfig):
 
 
 class SyncBoard(SyncSource):
-    """A sync source that is a board at a port: it may play a program although its answer to `run` did not arrive."""
+    """A sync source that is a board at a port. It may be playing a program although its answer to `run` did not
+    arrive."""
 
     _lowered = 0
     """Number of calls of `gate_low` and `abort`."""
@@ -86,20 +87,21 @@ class SyncBoard(SyncSource):
             self._may_play.set()
 
     def gate_low(self) -> None:
-        """See `SyncSource`. A `run` on its way is ended, too."""
+        """See `SyncSource`. The call also ends a `run` that is under way on another thread."""
         self._lowered += 1
         super().gate_low()
         self._may_play.clear()
 
     def abort(self) -> None:
-        """See `SyncSource`. A `run` on its way is ended, too."""
+        """See `SyncSource`. The call also ends a `run` that is under way on another thread."""
         self._lowered += 1
         super().abort()
         self._may_play.clear()
 
     def run(self) -> None:
-        """Play the program from its first word. If that fails once begun, or another thread calls `gate_low` or `abort`
-        meanwhile, takes all outputs low before it raises; a failure of that is only logged."""
+        """Begin to play the program from its first word. If that fails after it has begun, or another thread calls
+        `gate_low` or `abort` meanwhile, takes all outputs low and raises the error. If the outputs cannot be taken low,
+        that is only logged."""
         lowered = self._lowered
         try:
             super().run()

@@ -4,10 +4,10 @@ Facts: docs/reference/devices/prawndo.md, from `prawn_do/prawn_do.{c,pio}` of la
 3fecbdd (BSD). Outputs (docs/reference/hardware.md, Wiring and timing): unless the config says otherwise, GPIO0 triggers
 the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
 
-The firmware has neither loops nor a watchdog. So programs are written out in full and end with two words that hold
+The firmware has neither loops nor a watchdog. So programs are written out in full. They end with words that hold
 everything low, whatever happens to the host. The firmware cannot read its pins while a program runs, nor report whether
-it waits or plays. The trigger is a level, so a wait passes at once while it is high; a held pulse checks the scan
-marker in this way. Pulses that the board would play differently from what was written are refused.
+it waits or plays. The trigger is a level, so a wait ends at once if the trigger is high; short waits within a held
+pulse check the scan marker in this way. Pulses that the board would play differently from what was written are refused.
 """
 
 import logging
@@ -41,7 +41,8 @@ WORD = np.dtype([("outputs", "<u2"), ("cycles", "<u4")])
 
 @dataclass(frozen=True, slots=True)
 class ProgramLimits:
-    """Limits of a program. trigger_pulse_s: the longest scan marker of a program without held pulses."""
+    """Limits of a program. name: the board's name in messages. trigger_pulse_s: the longest time for which the scan
+    marker may be high if a program has no held pulses."""
 
     name: str
     clock_hz: float
@@ -51,9 +52,8 @@ class ProgramLimits:
 
 
 def compile_program(pulses: Sequence[Pulse], repeats: int, board: ProgramLimits) -> NDArray[np.void]:
-    """The words of the whole program, `WORD` (n,), with repeats written out and an end with all outputs low. May
-    raise `LimitExceeded`.
-    """
+    """The words of the whole program, `WORD` (n,), with repeats written out and an end with all outputs low. Raises
+    `LimitExceeded` for words or waits that the board cannot play, and for too many words."""
     _check_waits(_words(pulses, board), repeats, board)
     period = _words(sliced(pulses), board)
     # Two words of 0 cycles in a row end a program. A wait just before the end would be the first of these two, and its
@@ -181,10 +181,10 @@ class PrawnDo(SerialDevice, SyncBoard):
     ) -> "PrawnDo":  # fmt: skip
         """Open a board by itself, without a config file.
 
-        port, settings (gate_output, frame_output, marker_output): as in `PrawnDoConfig`. external_clock_hz: of the
-        clock on GPIO20, None for the board's own. surroundings: clock, tap and emulated ports; None: the system's clock
-        and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another `DeviceError` if the
-        board cannot be opened.
+        port, settings (gate_output, frame_output, marker_output): as in `PrawnDoConfig`. external_clock_hz: rate of the
+        clock on GPIO20; None: the board's own clock is used. surroundings: clock, tap and emulated ports; None: the
+        system's clock and real ports only. Raises `LimitExceeded` for a setting that is not possible, and another
+        `DeviceError` if the board cannot be opened.
         """
         config = config_of(PrawnDoConfig, port=port, external_clock_hz=external_clock_hz, **settings)
         return cls(config, surroundings or alone())
@@ -203,17 +203,18 @@ class PrawnDo(SerialDevice, SyncBoard):
 
     @property
     def identity(self) -> str:
-        """Firmware, memory and clock; a board has no serial number of its own."""
+        """Name, firmware, memory and clock; a board has no serial number of its own."""
         board = self._board
         return f"{self.name} firmware {self._firmware}, {board.max_words} words, {board.clock_hz / 1e6:g} MHz"
 
     @property
     def resolution_s(self) -> float:
-        """One cycle of the clock: 10 ns with the board's own clock."""
+        """One cycle of the clock in seconds: 1e-8 with the board's own clock."""
         return 1 / self._board.clock_hz
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
-        """Number of times that `pulses` fit into the memory with the words at the end; the board has no loops."""
+        """Number of times that `pulses` fit into the memory, with three words kept for the end; the board has no
+        loops."""
         return (self._board.max_words - 3) // len(sliced(pulses))
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:

@@ -1,9 +1,9 @@
 """Commands and answers of a PrawnDO on its serial line, and how its outputs are taken low whatever is under way.
 
 The firmware does not mark where an answer begins or ends (docs/reference/devices/prawndo.md). So every command is sent
-between two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way an answer that is
-late, repeated or missing is recognised. Queries on which the safety of the light depends are sent twice. Taking the
-outputs low overtakes all other commands.
+between two lines of nonsense, new each time, which the firmware repeats in its complaint. In this way a late, repeated
+or missing answer is recognised. Queries on which the safety of the light depends are sent twice. Taking the outputs low
+overtakes all other commands.
 """
 
 import logging
@@ -82,10 +82,10 @@ class PrawnDoLine:
     def connect(self, most_words: int) -> None:
         """Take all outputs low before anything else is asked, whatever state an earlier host left the board in.
 
-        A board in the middle of a program is freed only if the port shows the right USB ids: that takes hundreds of
-        kilobytes, which nothing else should get. most_words: the largest memory of any board, in words. Raises
-        `ProtocolError` if it is something else, `DeviceTimeout` if nothing answers, `DeviceFault` if the outputs do not
-        go low.
+        If an earlier host never finished sending a program, it is completed with zeros, but only if the port shows the
+        right USB ids: that takes hundreds of kilobytes, which no other device should get. most_words: the largest
+        memory of any board, in words. Raises `ProtocolError` if something else than a PrawnDO answers, `DeviceTimeout`
+        if nothing answers, `DeviceFault` if the outputs do not go low.
         """
         found = self.port.usb_ids
         if found is not None and found != USB_IDS:
@@ -125,19 +125,22 @@ class PrawnDoLine:
             return self._until(lambda lines: bool(lines) and after in lines[-1], before, deadline_s, urgent)[:-1]
 
     def send(self, command: str) -> None:
-        """Send a command and wait for no answer. One that comes is not between the lines of nonsense of another."""
+        """Send a command and wait for no answer. An answer that comes all the same lies outside the lines of nonsense
+        around other commands, and is not taken for theirs."""
         with self.lock:
             self._pay_debt()
             self.port.write(f"\n{command}\n".encode())
 
     def command(self, command: str) -> None:
-        """Send a command that is answered with `ok`. Raises `DeviceFault` for any other answer."""
+        """Send a command that is answered with `ok`. Raises `DeviceFault` for any other answer, and what `transact`
+        raises."""
         lines = self.transact(command)
         if lines != ["ok"]:
             raise DeviceFault(f"{self._name}: {command} was answered {lines}, not ok")
 
     def run_status(self, deadline_s: float | None = None, *, urgent: bool = False) -> tuple[int, bool]:
-        """The number of `run-status`, and whether the external clock is in use."""
+        """The number of `run-status`, and whether the external clock is in use. Arguments and errors as in `transact`;
+        `ProtocolError` also if two readings differ."""
 
         def parse(line: str) -> tuple[int, bool]:
             run, clock = (part.split(":") for part in line.split(" "))
@@ -148,11 +151,13 @@ class PrawnDoLine:
         return self._ask_twice("sts", parse, deadline_s, urgent)
 
     def pins(self, deadline_s: float | None = None, *, urgent: bool = False) -> int:
-        """Levels of the outputs. They can be read only in the states `IDLE`."""
+        """Levels of the outputs, one bit for each pin. They can be read only in the states `IDLE`. Arguments and errors
+        as in `run_status`."""
         return self._ask_twice("gto", lambda line: int(line, 16), deadline_s, urgent)
 
     def load(self, payload: bytes) -> None:
-        """Replace the program by these six-byte words. Raises `DeviceFault` for another answer than `ok`."""
+        """Replace the program by these six-byte words. Raises `DeviceFault` for another answer than `ok`, and what
+        `transact` raises."""
         with self.lock:
             before, after = self._token(), self._token()
             self._pay_debt()
@@ -172,10 +177,10 @@ class PrawnDoLine:
     def lower(self) -> None:
         """End the program and take all outputs low; returns as soon as they read back low.
 
-        `abt` alone leaves the outputs as they are, and `man` is executed only once the program has been ended. Both
-        are sent at once; then the outputs are checked and the commands repeated until they are low. Raises
-        `DeviceTimeout` or `ProtocolError` if the board does not answer properly, in which case the gate may be high,
-        and `DeviceFault` if its outputs do not go low.
+        `abt` alone leaves the outputs as they are, and `man` is executed only once the program has been ended. Both are
+        sent at once. Then the outputs are checked, and the commands repeated until the outputs are low or `lower_s` is
+        over. Raises `DeviceTimeout` or `ProtocolError` if the board does not answer properly, in which case the gate
+        may be high, and `DeviceFault` if its outputs do not go low.
         """
         self._gate_first.set()
         try:

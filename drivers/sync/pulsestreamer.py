@@ -5,19 +5,19 @@ channel 1 is the laser's gate, channel 2 marks records. The vendor's package `pu
 port, waits 10 s for an answer, prints, and obeys the environment's web proxies.
 
 **Waits.** The box cannot wait within a sequence. It waits for a rising edge of its trigger input before one, plays it,
-and ignores edges meanwhile. So a program may wait for the scan marker where it begins, and again only where it repeats:
-what follows each wait must be the same. Other programs, such as blanking patterns, are refused.
+and ignores edges meanwhile. So a program may wait for the scan marker only where it begins and where it repeats, and
+the words after each wait must be the same. Other programs, such as blanking patterns, are refused.
 
 **Repeats.** After a sequence the box arms itself again, for ever. A program of one sweep, or without waits, is played
 without that, so the box itself ends it. For more sweeps a thread counts them by asking whether the box plays, and takes
-the outputs low after the last one. It counts none too many, so no sweep stays dark. It may count too few if computer or
-network are late; then the gate goes on opening at each scan marker until the count is full, the markers cease or
+the outputs low after the last one. It never counts too many, so no sweep stays dark. It may count too few if computer
+or network are late; then the gate goes on opening at each scan marker until the count is full, the markers cease or
 `abort` is called. If the box does not answer for `silence`, `port_lost` tells the guard, which ends the laser's light.
 
-**Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so a mirror that stops
-would be lit until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless the
-config says `hold: external`: a logic chip (AND) between box and laser lets the gate through only while the scan marker
-is high. The driver cannot see this chip; docs/how-to/devices.md says how to wire and try it.
+**Held pulses** (`Pulse.held`). Once triggered, the box does not look at the scan marker again, so if the mirror stops,
+the light stays on until the sequence ends. Therefore a held pulse must end within `HOLD_S` of the marker's edge, unless
+the config says `hold: external`: a logic chip (AND) between box and laser lets the gate through only while the scan
+marker is high. The driver cannot see this chip; docs/how-to/devices.md says how to wire and try it.
 
 **Outputs cannot be read back.** They are reported as 0 when the box has confirmed `constant` with all low, has no
 hardware trigger armed, and says that it plays nothing; and as None otherwise.
@@ -124,12 +124,13 @@ class PulseStreamer(SyncBoard):
     """A Pulse Streamer 8/2. Opening it first takes all outputs low, whatever the box was doing, and resets it.
 
     The box obeys everybody on its network: keep other programs away from it. A program of several sweeps is ended by
-    this computer. If nobody closes the device, that is done when the object is deleted or Python ends; if the process
-    is killed, the box opens the gate at every scan marker until a program opens the box again.
+    this computer. If nobody closes the device, its outputs are taken low when the object is deleted or Python ends. If
+    the process is killed, the box opens the gate at every scan marker until a program opens the box again.
     """
 
     def __init__(self, config: PulseStreamerConfig, surroundings: Surroundings, call_s: float = CALL_S) -> None:
-        """call_s: longest wait for an answer."""
+        """call_s: longest wait for an answer, in seconds. Raises `DeviceNotFound` if the box does not answer, and
+        another `DeviceError` if it cannot be used."""
         super().__init__("Pulse Streamer")
         self._config, self._clock = config, surroundings.clock
         self._rpc = JsonRpc(self.name, resolve(config.port, surroundings.ports).address, surroundings.tap, call_s)
@@ -190,8 +191,8 @@ class PulseStreamer(SyncBoard):
 
     @property
     def resolution_s(self) -> float:
-        """1 ns. The box lengthens a sequence to a multiple of 8 ns, by its last levels, and samples its trigger every 8
-        ns: a sweep begins 61 to 69 ns after the scan marker."""
+        """1e-9 s. The box lengthens a sequence to a multiple of 8 ns by holding its last levels, and samples its
+        trigger every 8 ns: a sweep begins 61 to 69 ns after the scan marker."""
         return RESOLUTION_S
 
     @property

@@ -1,9 +1,9 @@
-"""JSON-RPC over HTTP with a Pulse Streamer: a connection of its own for each call, and a deadline for the whole of it.
+"""JSON-RPC over HTTP with a Pulse Streamer: each call has a connection of its own, and a deadline for the whole call.
 
 The box answers at port 8050 under /json-rpc (docs/reference/devices/pulsestreamer.md). As in Swabian's clients, each
 call has a connection of its own, so that one that hangs holds up no other, least of all one that takes the gate low.
-The number in an answer is not compared with that of the question: newer clients that do so refuse the box's answers.
-Boxes are found by a datagram, as the vendor's client finds them.
+The number in an answer is not compared with that of the question: newer clients that do so refuse the box's answers. As
+in the vendor's client, boxes are found by a datagram that they answer.
 """
 
 import errno
@@ -95,13 +95,14 @@ class JsonRpc:
 
     @property
     def settles_in_s(self) -> float:
-        """Time in which the box may still hear a call, other than a question, that it has not answered; 0 or less if
-        there is none."""
+        """Seconds for which the box may still hear a call that it has not answered; 0 or less if there is no such call.
+        Questions do not count."""
         return self._unanswered_s + LATE_CALLS * self.call_s - time.monotonic()
 
     def ask(self, method: str, silence_s: float) -> Any:
-        """Ask the box a question; after half of `silence_s` ask once more, by another connection: if the first packet
-        of a connection is lost, the computer sends it again only after 1 s. Raises as `call`."""
+        """Ask the box a question and return its answer. After half of `silence_s` seconds ask once more, over another
+        connection: if the first packet of a connection is lost, the computer sends it again only after 1 s. Raises as
+        `call`."""
         try:
             return self.call(method, within_s=silence_s / 2)
         except GONE:

@@ -1,4 +1,5 @@
-"""Sequences of a Pulse Streamer: the one for a program of the sync source, and the number of its sweeps so far.
+"""Sequences of a Pulse Streamer: the sequence for a program of the sync source, and the count of the sweeps played so
+far.
 
 The box cannot wait within a sequence, nor look at the scan marker while it plays: see `pulsestreamer`.
 """
@@ -38,7 +39,8 @@ _CLOCK_TOLERANCE = 1e-3
 class GateSequence:
     """Steps that the box plays again and again. steps: `STEP` (n,). sweeps: how often they are played.
 
-    waits: whether the box waits for the scan marker each time before. rest: levels of the channels meanwhile.
+    waits: whether the box waits for the scan marker each time before it plays them. rest: levels of the channels during
+    the wait, one bit for each.
     """
 
     steps: NDArray[np.void]
@@ -60,7 +62,8 @@ class GateSequence:
 def compile_sequence(
     name: str, pulses: Sequence[Pulse], repeats: int, pins: OutputPins, *, external_hold: bool
 ) -> GateSequence:
-    """The sequence for a program. external_hold: whether hardware ANDs the gate with the scan marker.
+    """The sequence for a program. name: the box's name in messages. external_hold: whether hardware ANDs the gate with
+    the scan marker.
 
     Raises `LimitExceeded` for waits that the box cannot play, held pulses that nothing holds, and words that are too
     short or too many.
@@ -119,8 +122,9 @@ def _require_short_holds(name: str, pulses: Sequence[Pulse]) -> None:
 class SweepCount:
     """Counts the sweeps that a box has played, from its answers to the question whether it plays. Thread-safe.
 
-    Times are seconds of the device's clock. An answer is true of some moment between question and answer. A box that
-    plays has begun a new sweep if it did not play before, or if the last sweep must be over. So none is counted twice.
+    Times are seconds of the device's clock. An answer tells what the box did at some moment between question and
+    answer. A box that plays has begun a new sweep if it did not play before, or if the last sweep must be over. So no
+    sweep is counted twice.
     """
 
     sweeps: int
@@ -139,8 +143,9 @@ class SweepCount:
         self.idle_s = self._began_after_s = self.heard_s
 
     def take(self, asked_s: float, answered_s: float, plays: bool) -> bool:
-        """Take an answer in; returns whether the last sweep is over. Answers that overlap an earlier one are dropped:
-        it is not known which of the two is newer."""
+        """Take an answer in; returns whether the last sweep is over. asked_s, answered_s: times of question and answer.
+        If the question was asked before the last answer came, it is not known which answer is newer: this one is
+        dropped, and False returned."""
         with self._lock:
             if asked_s < self.heard_s:
                 return False
@@ -156,7 +161,7 @@ class SweepCount:
             return self.done > self.sweeps or (self.done == self.sweeps and not plays)
 
     def pause_s(self, now_s: float) -> float:
-        """Time until the next question: short when a sweep may begin or end."""
+        """Seconds until the next question: short when a sweep may begin or end."""
         with self._lock:
             if self.plays:
                 due_s = self._began_after_s + self.duration_s - now_s

@@ -1,12 +1,13 @@
 """A Teensy 4.0 or 4.1 with this project's firmware: three outputs, 10 ns steps, repeats, a trigger, pins read back.
 
 Protocol: docs/reference/teensy.md, version 1. The board itself ends a held pulse when the scan marker falls. It takes
-its outputs low when the port closes, so usually when the process that holds it dies. Where the board does not learn of
-that, its watchdog does the same: a computer that freezes, or a port that another process still holds open.
+its outputs low when the port closes, so usually when the process that holds it dies. If the computer freezes, or
+another process still holds the port open, the board does not learn of that; then its watchdog takes the outputs low.
 
 The driver's own thread feeds the watchdog, since nobody else asks a sync source regularly, neither a notebook nor the
-guard. The guard watches the application, and the application the guard, so this thread need not watch either: it ends
-with its process, or if the device is deleted. Each line that is sent may delay one edge by up to 4 us, so it sends few.
+guard. The guard watches the application, and the application the guard, so this thread need not watch either of them.
+It ends with its process, or if the device is deleted. Each line that it sends may delay one edge by up to 4 us, so it
+sends few.
 """
 
 import logging
@@ -48,7 +49,8 @@ _ANY = re.compile(".*")
 
 @dataclass(frozen=True, slots=True)
 class BoardLimits:
-    """Limits of a program, as `id` reports them. shortest: ticks of the shortest word that is no wait."""
+    """Limits of a program, as `id` reports them. name: the board's name in messages. words: most words. shortest: ticks
+    of the shortest word that is no wait."""
 
     name: str
     words: int = 30_000
@@ -57,7 +59,8 @@ class BoardLimits:
 
 
 def encode(pulses: Sequence[Pulse], repeats: int, board: BoardLimits) -> list[str]:
-    """The lines `new`, `add` (at least one) and `end` that load a program. May raise `LimitExceeded`."""
+    """The lines `new`, `add` (at least one) and `end` that load a program. Raises `LimitExceeded` for too many words or
+    repeats, and for a word that is too short or too long."""
     if len(pulses) > board.words:
         raise LimitExceeded(
             f"{board.name}: a program of {len(pulses)} words; it holds {board.words}: scan fewer sweeps at a time"
@@ -137,7 +140,7 @@ class Teensy(SerialDevice, SyncBoard):
         return cls(config_of(TeensyConfig, port=port, watchdog_s=watchdog_s), surroundings or alone())
 
     def ask(self, command: str) -> str:
-        """Send a raw command, once, and return the board's answer, also if it is an error. The command is not checked:
+        """Send a raw command, once, and return the board's answer, even if it is an error. The command is not checked:
         the raw command `run` can raise the gate, and no thread feeds the board's watchdog then. Raises `DeviceError` if
         no answer comes."""
         self._require("ask", *OPEN_STATES)
@@ -151,18 +154,18 @@ class Teensy(SerialDevice, SyncBoard):
 
     @property
     def identity(self) -> str:
-        """Serial number, version of the protocol, memory and tick."""
+        """Name, serial number, version of the protocol, memory and tick."""
         board = self._board
         return f"{self.name} {self._serial}, firmware {VERSION}, {board.words} words, {board.tick_ns} ns"
 
     @property
     def serial(self) -> str:
-        """The serial number, the same as in USB."""
+        """The board's serial number, which is also its USB serial number."""
         return self._serial
 
     @property
     def resolution_s(self) -> float:
-        """One tick: 10 ns."""
+        """One tick of the board in seconds: 1e-8 with this project's firmware."""
         return self._board.tick_ns * 1e-9
 
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:

@@ -1,7 +1,7 @@
 """Commands and answers of a Teensy on its serial line, and how its outputs are taken low whatever is under way.
 
-Each command carries a tag that its answer repeats, and each answer a checksum (docs/reference/teensy.md). So late,
-lost and damaged answers are recognised; they count as none.
+Each command carries a tag that its answer repeats, and each answer a checksum (docs/reference/teensy.md). So late, lost
+and damaged answers are recognised and count as missing.
 """
 
 import itertools
@@ -49,9 +49,10 @@ class TeensyLine:
         self._heard = b""
 
     def connect(self) -> re.Match[str]:
-        """Take all outputs low, whatever an earlier host left behind; returns the answer to `id`, an `IDENTITY`.
+        """Take all outputs low, whatever an earlier host left behind; returns the match of `IDENTITY` with the answer
+        to `id`.
 
-        Raises `ProtocolError` if it is something else, `DeviceTimeout` if nothing answers.
+        Raises `ProtocolError` if something else answers, `DeviceTimeout` if nothing answers.
         """
         found = self.port.usb_ids
         if found not in (None, USB_IDS):
@@ -72,9 +73,11 @@ class TeensyLine:
         return self.ask("id", IDENTITY, TRIES)
 
     def ask(self, command: str, form: re.Pattern[str], tries: int = 1) -> re.Match[str]:
-        """The answer to a command, without tag and checksum. tries: above 1 only for commands that may come twice.
+        """Send a command; returns the match of `form` with its answer, from which tag and checksum are removed. tries:
+        above 1 only for commands that may come twice.
 
-        Raises `DeviceTimeout` if none comes, `CommandRefused` for an error, `ProtocolError` if it lacks the `form`.
+        Raises `DeviceTimeout` if no answer comes, `CommandRefused` if it is an error, and `ProtocolError` if it is not
+        of the `form`.
         """
         tag = b"#%08x " % (next(self._tags) & 0xFFFFFFFF)
         answer: str | None = None
@@ -97,17 +100,19 @@ class TeensyLine:
         raise ProtocolError(f"{self._name} answered {shown} with {answer[:40]!r}; check its firmware")
 
     def send(self, command: str) -> None:
-        """Send a command without a tag, and do not wait for the answer. It has no tag either, and is dropped later."""
+        """Send a command without a tag, and do not wait for the answer. The answer has no tag either, and is dropped
+        later."""
         self._write(command.encode("ascii", "replace"))
 
     def status(self) -> SyncStatus:
-        """State of the program, and the outputs as the board reads them back."""
+        """State of the program, and the outputs as the board reads them back. Raises as `ask`."""
         answer = self.ask("status", STATUS, TRIES)
         state = cast(Literal["stopped", "waiting", "running", "aborted"], answer["state"])
         return SyncStatus(state, int(answer["pins"]))
 
     def lower(self, command: Literal["low", "abort"]) -> None:
-        """Take outputs low: at once, whatever other threads wait for, and once more when it is this thread's turn."""
+        """Take the gate ("low") or all outputs ("abort") low: at once, whatever other threads wait for, and once more
+        when it is this thread's turn. Raises as `ask`."""
         self._write(command.encode())  # its answer, without a tag, is dropped
         self.ask(command, STATUS, TRIES)
 

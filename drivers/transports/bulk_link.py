@@ -47,7 +47,8 @@ class PlainLink(UsbDevice):
     """A streaming USB device read through pyusb: one read after the other, with gaps between them."""
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
-        """Open the device of a listing and claim its interfaces."""
+        """Open the device of a listing and claim its interfaces. label: the kind of device in messages. Raises
+        `DeviceError` if that fails."""
         super().__init__(listing, label, dict.fromkeys(interfaces, 0))
         self._queue: deque[tuple[int, Buffer]] = deque()
         self._scratch = array.array("B")
@@ -60,7 +61,8 @@ class PlainLink(UsbDevice):
 
     def reap(self, timeout_s: float) -> tuple[Buffer, int] | None:
         """Read into the oldest queued buffer now; returns it and the number of bytes read. None if nothing is queued,
-        or if it is neither filled nor ended by a short packet in time; the next call then continues with it."""
+        or if the buffer is neither filled nor ended by a short packet in time; the next call then continues with the
+        same buffer."""
         if not self._queue:
             return None
         endpoint, buffer = self._queue[0]
@@ -94,7 +96,8 @@ class QueuedLink:
     """
 
     def __init__(self, listing: UsbListing, label: str, interfaces: tuple[int, ...]) -> None:
-        """Open the device of a listing and claim its interfaces."""
+        """Open the device of a listing and claim its interfaces. label: the kind of device in messages. Raises
+        `DeviceError` if that fails."""
         import usb1
 
         try:
@@ -149,12 +152,14 @@ class QueuedLink:
     def control_in(
         self, request_type: int, request: int, value: int, index: int, length: int, timeout_s: float
     ) -> bytes:
-        """Make a control transfer that reads."""
+        """Make a control transfer that reads; returns its bytes. Raises `DeviceFault` if the device refuses it
+        (stall)."""
         with self._translated(0, timeout_s):
             return bytes(self._handle.controlRead(request_type, request, value, index, length, milliseconds(timeout_s)))
 
     def submit(self, endpoint: int, buffer: Buffer) -> bool:
-        """Queue a read of the whole buffer. False if the kernel takes no more while at least one read is in flight."""
+        """Queue a read that fills the buffer. Returns False if the kernel takes no more reads while at least one is in
+        flight."""
         read = _Read(self._transfer(), buffer)
         with self._translated(endpoint):
             try:
@@ -181,7 +186,8 @@ class QueuedLink:
         return read.buffer, read.got
 
     def cancel(self) -> None:
-        """End all reads and drop what they hold; waits until the kernel has released their memory. Never raises."""
+        """End all queued reads and drop what they have received; waits until the kernel has released their memory.
+        Never raises."""
         for read in reversed(self._queue):  # the newest first, so that none of them begins meanwhile
             with suppress(self._usb1.USBError):
                 read.transfer.cancel()

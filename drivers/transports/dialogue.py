@@ -1,17 +1,18 @@
 """A dialogue with a device that answers one command at a time: paced, checked, and synchronised after a lost reply.
 
-Nothing on a laser's line checks or numbers a reply (docs/reference/hardware.md, Lasers on a serial line), so a late one
-would be taken for the answer to the next command. Therefore the input is dropped before each command, and each reply
-must have the form that its command calls for. If a reply has another form, or none comes, the line is drained, a query
-is sent whose answer is known, and then the command again. The form of a make's commands and replies is its `Framing`.
+Replies of a laser have neither a checksum nor a number (docs/reference/hardware.md, Lasers on a serial line), so a late
+reply would be taken for the answer to the next command. Therefore the input is dropped before each command, and each
+reply must have the form that its command calls for. If a reply has another form, or none comes, the line is drained, a
+query is sent whose answer is known, and then the command again. The form of a make's commands and replies is its
+`Framing`.
 
-Threads take turns through a `FairLock`. A thread that polls a slow device takes its lock again as soon as it has
-released it; with a plain lock the thread that wants to switch the laser off could wait for ever.
+Threads take turns through a `FairLock`. A thread that polls a slow device takes the lock again as soon as it has
+released it. With a plain lock the thread that wants to switch the laser off could therefore wait for ever.
 
-The guard has to know soon that a firmware hangs. So a dialogue can be *watched*: then the answer to a question must
-begin within the kind's `silence`. If it does not, one more question is sent, the one that this firmware answers
-fastest, and if nothing at all comes within `AGAIN_S`, the device is silent. Commands that set something may take the
-usual time, since a firmware may be slow to store it.
+The guard has to know soon if a firmware hangs. So a dialogue can be *watched*: then the answer to a question must begin
+within the kind's `silence`. If it does not, one more question is sent, the one that this firmware answers fastest, and
+if nothing at all comes within `AGAIN_S`, the device is silent. Commands that set something may take the usual time,
+since a firmware may be slow to store it.
 """
 
 import logging
@@ -58,7 +59,7 @@ class FairLock:
     """A lock for `with`, not re-entrant. A waiting thread gets the lock before the thread that had it last.
 
     An interrupt just as the lock is taken or released may leave it held. The thread that was interrupted then has it
-    when it next enters; any other takes it after `LEFT_HELD_S`. So nobody who wants the light off waits for ever.
+    when it next enters; any other takes it after `LEFT_HELD_S`. So no thread that wants the light off waits for ever.
     """
 
     def __init__(self) -> None:
@@ -74,7 +75,7 @@ class FairLock:
             self._turn.give()
 
     def __exit__(self, *_: object) -> None:
-        """Release the lock. A waiting thread gets it."""
+        """Release the lock. If a thread waits, it gets the lock."""
         self._held.give()
 
 
@@ -125,7 +126,7 @@ class Framing(Protocol):
 
     @property
     def quickest(self) -> str:
-        """The question that the device itself, and not only a controller before it, answers fastest."""
+        """The question that is answered fastest by the device itself, and not by a controller in front of it."""
 
     def asks(self, command: str) -> bool:
         """Whether a command only asks for something."""
@@ -134,12 +135,11 @@ class Framing(Protocol):
         """The bytes of a command."""
 
     def read(self, command: str, read_line: Callable[[], str]) -> str:
-        """The reply to a command, read with as many calls of `read_line` as it has lines; "" if the lines do not belong
-        together.
-        """
+        """The reply to a command, read with one call of `read_line` for each of its lines; "" if the lines are no
+        proper reply."""
 
     def refusal(self, reply: str) -> str | None:
-        """The reason for which `reply` refuses its command; None if it is no refusal."""
+        """The reason that `reply` gives if it refuses its command; None if it is no refusal."""
 
 
 class Dialogue:
@@ -161,13 +161,13 @@ class Dialogue:
         """Whether a reply may come that nobody waits for."""
 
     def watch(self, on_silence: OnSilence | None, silence_s: float, overloaded: Callable[[], bool]) -> None:
-        """Watch the dialogue from now on: a question unanswered for `silence_s` shows that the device may hang. If it
-        says nothing within `AGAIN_S` after another question, `on_silence` is called, and what was asked raises
-        `DeviceTimeout` at once. on_silence: None to watch no longer. overloaded: as in `LineLaser.watch`."""
+        """Watch the dialogue from now on: a question unanswered for `silence_s` shows that the device may hang. If the
+        device says nothing within `AGAIN_S` after another question, `on_silence` is called, and the call that asked
+        raises `DeviceTimeout` at once. on_silence: None to watch no longer. overloaded: as in `LineLaser.watch`."""
         self._on_silence, self._silence_s, self._overloaded = on_silence, silence_s, overloaded
 
     def check_alive(self) -> None:
-        """Ask the question that is answered fastest. Raises `DeviceTimeout` if the device is silent."""
+        """Ask the question that the device answers fastest. Raises `DeviceTimeout` if the device is silent."""
         self.ask(self._framing.quickest, _ANY)
 
     def encode(self, command: str) -> bytes:
@@ -196,7 +196,8 @@ class Dialogue:
             self._resync(self._timing.quiet_s / 3)
 
     def tell(self, command: str) -> None:
-        """Send a command. May raise `CommandRefused`, `DeviceTimeout`, `ProtocolError` or `DeviceDisconnected`.
+        """Send a command and wait until the device has confirmed it. May raise `CommandRefused`, `DeviceTimeout`,
+        `ProtocolError` or `DeviceDisconnected`.
 
         If the reply is lost, the command is sent again; all commands of the drivers may be repeated.
         """
@@ -227,11 +228,11 @@ class Dialogue:
             raise ProtocolError(f"{self.name} answered {command!r} with {reply[:40]!r}; check its cable and firmware")
 
     def ask_flag(self, command: str) -> bool:
-        """The reply to a query that is answered with 0 or 1."""
+        """The answer to a query that is answered with 0 or 1, as a bool. Errors as in `tell`."""
         return self.ask(command, FLAG) == "1"
 
     def ask_number(self, command: str) -> float:
-        """The reply to a query that is answered with a number."""
+        """The number in the answer to a query. Errors as in `tell`."""
         return float(self.ask(command, NUMBER))
 
     def ask_surely(self, command: str, form: re.Pattern[str]) -> str:
@@ -247,9 +248,9 @@ class Dialogue:
         raise ProtocolError(f"{self.name} answers {command!r} differently each time; check its cable")
 
     def tell_and_check(self, command: str, query: str, form: re.Pattern[str], wanted: Callable[[str], bool]) -> None:
-        """Set a value and read it back, up to three times; only what reads back counts. If it is not `wanted`, raises
-        `CommandRefused` if the device refused the command, else `DeviceFault`. Other errors as in `tell`.
-        """
+        """Set a value with `command` and read it back with `query`, up to three times; only what reads back counts.
+        wanted: tells whether a reply is right. If none is, raises `CommandRefused` if the device refused the command,
+        else `DeviceFault`. Other errors as in `tell`."""
         reply = ""
         for _ in range(_ATTEMPTS):  # a bit may flip in the answer as well as in the command
             refused: CommandRefused | None = None

@@ -32,13 +32,13 @@ class Endpoint:
 
 
 def printable(text: str) -> str:
-    """Text from a device, for messages and lists: what commands a terminal, and anything else that it cannot show, is
-    shown as its escape."""
+    """Text from a device, for messages and lists. Characters that a terminal cannot show, or would obey, are replaced
+    by their escapes."""
     return text if text.isprintable() else "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 def one_line(said: object) -> str:
-    """The text of another library's error, or of a device, as a single line."""
+    """The text of another library's error, or of a device, as a single line that a terminal can show (`printable`)."""
     return printable(" ".join(str(said).split()))
 
 

@@ -7,11 +7,11 @@ from drivers.transports.serial_port import SerialPort
 
 
 class SerialLine(Protocol):
-    """The dialogue of one kind of device."""
+    """The dialogue with one kind of device, over a serial port."""
 
     @property
     def port(self) -> SerialPort:
-        """The port that it uses."""
+        """The port that the dialogue uses."""
 
     def send(self, command: str) -> None:
         """Send a command as the device expects it, and do not wait for a reply. A reply that comes all the same is not

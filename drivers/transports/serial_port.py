@@ -1,8 +1,8 @@
 """A serial port with a deadline on every call, and one typed error for each way in which it can fail.
 
-Wraps pyserial. Its exceptions for a lost port depend on the call, so all of them are caught around every call.
-Deadlines are in the host's time, since pyserial waits in no other; an emulated port (`Endpoint.serial_port`) brings its
-own clock. Network ports are refused, because those of pyserial 3.5 write without a deadline.
+Wraps pyserial. Which exception pyserial raises for a lost port depends on the call, so all are caught around every
+call. Deadlines are in the host's time, since pyserial knows no other clock; an emulated port (`Endpoint.serial_port`)
+brings its own clock. Network ports are refused, because those of pyserial 3.5 write without a deadline.
 """
 
 import errno
@@ -54,7 +54,7 @@ _HELD = (errno.EBUSY, errno.EAGAIN)
 
 
 class SerialPort:
-    """An open serial port, held exclusively, 8N1 without flow control. `close` is idempotent.
+    """An open serial port, held exclusively, 8N1 without flow control. `close` may be called more than once.
 
     Not thread-safe: a driver that is polled from several threads must lock around a whole command and reply.
     """
@@ -99,9 +99,8 @@ class SerialPort:
         return None
 
     def write_again(self, data: bytes, times: int) -> None:
-        """Send `data` several times, with a pause of AGAIN_S after each, to a device whose answers nobody reads. Errors
-        as in `write`.
-        """
+        """Send `data` several times, with a pause of AGAIN_S after each, to a device whose answers are not read. Errors
+        as in `write`."""
         for _ in range(times):
             self.write(data)
             self.clock.sleep(AGAIN_S)
@@ -119,7 +118,8 @@ class SerialPort:
 
     def read_line(self, terminator: bytes, deadline_s: float) -> bytes:
         """The next line without its terminator. Raises `DeviceTimeout` after `deadline_s`, and keeps the part received
-        for the next call; `ProtocolError` if no line ends within 64 KiB; `DeviceDisconnected`.
+        for the next call. Raises `ProtocolError` if no line ends within 64 KiB, and `DeviceDisconnected` if the port is
+        lost.
 
         If the host was held up, the deadline is later, and what has arrived meanwhile is read before it counts.
         """

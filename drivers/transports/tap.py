@@ -37,7 +37,7 @@ class TapFile:
 
     @classmethod
     def begin(cls, path: Path) -> "TapFile":
-        """A new tap file whose time 0 is now."""
+        """A new tap file whose time 0 is now. The first `Tap` that writes creates the file."""
         return cls(str(path.absolute()), time.monotonic_ns())
 
     def sync(self) -> None:
@@ -66,7 +66,8 @@ class Tap:
         self._starting = threading.Lock()
 
     def note(self, port: str, direction: str, data: bytes) -> None:
-        """Note a piece of bytes; an empty one is not noted. Returns at once."""
+        """Note a piece of bytes; an empty one is not noted. Returns at once. port: "serial", "tcp" or an endpoint, for
+        example. direction: `OUT` or `IN`."""
         if not data:
             return
         t_ns = time.monotonic_ns() - self._file.start_ns
@@ -113,7 +114,7 @@ def _write(path: str, lines: _Lines) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TapRecord:
-    """A piece of bytes that passed a port."""
+    """A piece of bytes that passed a port. The fields are those of a line of `control.jsonl`."""
 
     t_ns: int
     device: str

@@ -22,7 +22,8 @@ _CONNECT_S = 5.0
 
 
 class TcpStream:
-    """An open connection. `close` is idempotent and may be called from any thread, all other methods from one."""
+    """An open connection. `close` may be called more than once and from any thread, all other methods from one
+    thread."""
 
     def __init__(self, name: str, address: str, connect_s: float = _CONNECT_S) -> None:
         """Connect within `connect_s`. name: the device's name in messages; address: "host:port".
@@ -90,7 +91,8 @@ class TcpStream:
         return bytes(buffer[:came])
 
     def drain(self, quiet_s: float, deadline_s: float) -> bytes:
-        """Read until nothing comes for `quiet_s`, at most for `deadline_s`; returns the last 64 KiB that came."""
+        """Read and drop until nothing comes for `quiet_s`, at most for `deadline_s`; returns the last 64 KiB that
+        came."""
         ends_at = time.monotonic() + deadline_s
         dropped = bytearray()
         while (left_s := ends_at - time.monotonic()) > 0 and (data := self.receive(min(quiet_s, left_s))):

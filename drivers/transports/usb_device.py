@@ -1,8 +1,9 @@
-"""One USB device, opened and claimed through pyusb. Every call has a deadline; every failure raises an error of ours.
+"""One USB device, opened and claimed through pyusb. Every call has a deadline; every failure raises one of
+`drivers.errors`.
 
 Addresses: "usb" (the only one attached), "usb:serial=ABC", "usb:path=1-2.4" (bus and hub ports, as in
-/sys/bus/usb/devices; for devices without a serial string). `backend` is a pyusb backend: None for the real libusb,
-an emulator's object otherwise. Between two reads nothing is queued; `bulk_link` has what a stream needs.
+/sys/bus/usb/devices; for devices without a serial string). `backend` is a pyusb backend: None for the real libusb, an
+emulator's object otherwise. Between two reads no transfer is queued; for a stream use `bulk_link`.
 
 Errors carry Linux error numbers, as pyusb sets them for libusb 1.0. Unplugging shows as ENODEV, EIO, ESHUTDOWN or
 ENOTCONN. If a read asks for fewer bytes than a packet has, it overflows and the packet is lost. The sum of all queued
@@ -60,7 +61,8 @@ def translated(label: str, endpoint: int | None = None, timeout_s: float | None 
 def usb_failure(
     label: str, number: int | None, text: str, endpoint: int | None = None, timeout_s: float | None = None
 ) -> DeviceError:
-    """The `DeviceError` for a failure in libusb. number: its errno, None if it has none. text: libusb's own message."""
+    """The `DeviceError` for a failure in libusb. number: its Linux error number; None if it has none. timeout_s: the
+    deadline that the message names. text: libusb's own message."""
     where = "" if endpoint is None else f" on endpoint 0x{endpoint:02x}"
     if number in _LOST:
         return DeviceDisconnected(f"{label}: the device is gone ({text}); check cable and power, open again")
@@ -91,7 +93,7 @@ class UsbId:
 class UsbListing:
     """A device on the bus, as far as it can be known without claiming it.
 
-    Strings are None if the device has none, or if they cannot be read, as without permission.
+    Strings are None if the device has none, or if they cannot be read, for example without permission.
     """
 
     path: str
@@ -106,7 +108,8 @@ class UsbListing:
 
 
 def attached(wanted: UsbId, backend: object | None = None) -> list[UsbListing]:
-    """The attached devices of one kind, ordered by path. Claims nothing and changes nothing."""
+    """The attached devices of one kind, ordered by path. Claims nothing and changes nothing. backend: a pyusb backend;
+    None: libusb. Raises `DeviceError` if libusb cannot be loaded."""
     ids = {"idVendor": wanted.vendor, "idProduct": wanted.product}
     devices = usb.core.find(find_all=True, backend=backend or _libusb(), **ids)
     with translated(wanted.label):
@@ -124,13 +127,13 @@ class UsbDevice:
     """An open device with its interfaces claimed and in the wanted alternate settings.
 
     Any thread may call its methods, but two transfers on one endpoint must not overlap. `close` waits for no transfer,
-    so end your threads first.
+    so first end the threads that use the device.
     """
 
     def __init__(self, listing: UsbListing, label: str, alternates: Mapping[int, int], tap: Tap | None = None) -> None:
         """Claim the interfaces in `alternates` and set each to its alternate setting. Usually called by `open_device`.
 
-        tap: records what `write` and `read` pass.
+        alternates: alternate setting by number of the interface. tap: records what `write` and `read` pass.
         """
         self.listing = listing
         self.label = f"{label} at {listing.address}"
@@ -186,14 +189,15 @@ class UsbDevice:
         return data
 
     def read_into(self, endpoint: int, buffer: "array.array[int]", timeout_s: float) -> int:
-        """Read into an existing array, whose size is whole packets; returns the number of bytes read."""
+        """Read into an existing array, whose size is whole packets; returns the number of bytes read. Raises
+        `DeviceTimeout` if nothing came."""
         with translated(self.label, endpoint, timeout_s):
             return int(self._device.read(endpoint, buffer, milliseconds(timeout_s)))
 
     def drain(self, endpoint: int, size: int, timeout_s: float, most: int = 1000) -> int:
         """Read and drop until nothing comes for `timeout_s`; returns the number of transfers dropped.
 
-        Raises `ProtocolError` after `most` of them, as a device that never falls silent follows another protocol.
+        Raises `ProtocolError` after `most` transfers, since a device that never falls silent follows another protocol.
         """
         for dropped in range(most):
             try:
@@ -243,7 +247,7 @@ def open_device(
 
 
 def find_device(wanted: UsbId, address: str, backend: object | None = None) -> UsbListing:
-    """The one device that an address means. Errors as in `open_device`, except for those of claiming it."""
+    """The only device that an address means. Errors as in `open_device`, except for those of claiming it."""
     key, _, value = address.removeprefix("usb:").partition("=")
     if address != "usb" and not (address.startswith("usb:") and key in ("serial", "path") and value):
         raise DeviceError(f"port {address!r} is no USB address; write usb, usb:serial=ABC or usb:path=1-2")
@@ -298,5 +302,5 @@ def _libusb() -> Any:
 
 
 def milliseconds(timeout_s: float) -> int:
-    """The time in milliseconds, at least 1, because libusb takes 0 as 'for ever'."""
+    """The time in milliseconds, at least 1, because libusb takes 0 as 'wait for ever'."""
     return max(1, round(timeout_s * 1000))
