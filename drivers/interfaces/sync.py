@@ -163,7 +163,9 @@ class SyncSource(Device):
                     raise LimitExceeded(f"{where} waits with the gate high (0x{pulse.outputs:x}); clear OUT_GATE 0x2")
             elif not isinstance(pulse.duration_s, Real):
                 raise LimitExceeded(f"{where} lasts {pulse.duration_s!r}; give a number of seconds")
-            elif not (math.isfinite(pulse.duration_s) and pulse.duration_s >= self.resolution_s / 2):
+            elif not math.isfinite(pulse.duration_s):
+                raise LimitExceeded(f"{where} lasts {pulse.duration_s:g} s; give a time, or None to wait for a sweep")
+            elif not pulse.duration_s >= self.resolution_s / 2:
                 raise LimitExceeded(
                     f"{where} lasts {pulse.duration_s:g} s, under the resolution {self.resolution_s:g} s; lengthen it"
                 )

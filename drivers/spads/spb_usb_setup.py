@@ -80,7 +80,7 @@ def identify(control: ControlChannel, name: str) -> SensorIdentity:
     capacity = control.read64(Register.DDR_BYTES) // frame_bytes(width, height)
     info = SpadInfo(
         model=control.read_text(Register.MODEL, TEXT_BYTES),
-        serial=control.read_text(Register.SERIAL, TEXT_BYTES) or "none",
+        serial=control.read_text(Register.SERIAL, TEXT_BYTES),
         width=width,
         height=height,
         rotation_deg=0,

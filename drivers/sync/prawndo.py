@@ -215,7 +215,7 @@ class PrawnDo(SerialDevice, SyncBoard):
     def most_repeats(self, pulses: Sequence[Pulse]) -> int:
         """Number of times that `pulses` fit into the memory, with three words kept for the end; the board has no
         loops."""
-        return (self._board.max_words - 3) // len(sliced(pulses))
+        return (self._board.max_words - 3) // max(len(sliced(pulses)), 1)
 
     def _do_program(self, pulses: Sequence[Pulse], repeats: int) -> None:
         words = compile_program(pulses, repeats, self._board)

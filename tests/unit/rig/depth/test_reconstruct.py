@@ -66,6 +66,10 @@ def test_a_strangers_estimator_that_errs_is_named(monkeypatch):
             replace(answer, confidence=answer.confidence * np.float32(np.nan)),
             "a confidence of nan, which must be from 0",
         ),
+        (
+            replace(answer, x2_px=answer.x_px, confidence2=np.full_like(answer.confidence, 1.5)),
+            "a confidence of 1.5, which must be from 0",
+        ),
         (replace(answer, x_px=answer.x_px.astype(float)), "x_px as float64 (32, 96)"),
         (replace(answer, signal=None), "signal as NoneType ()"),
     ):
