@@ -28,9 +28,11 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), mean fractional column of each column's frames; its own number if it has none.
-    compute_s: seconds of binding, counting and estimation, see `SharedTime`. taken: when its first and last frame were
-    taken, as in the manifest (`utc`, `utc_uncertainty_s`), by the arrivals so far; empty if it is not known.
+    column: float64 (columns,), mean fractional column of each column's frames; for a column without frames, its own
+    number.
+    compute_s: seconds of binding, counting and estimation, as `SharedTime` charges them.
+    taken: when the map's first and last frame were taken, as in the manifest (`utc`, `utc_uncertainty_s`), by the
+    arrivals so far; empty if that is not known.
     """
 
     sweep: SweepAccount

@@ -23,7 +23,8 @@ ACTIONS: Final = "rig.api.studies.cases"
 
 
 def cases_of(study: Study) -> list[Case]:
-    """The cases of a study whose action is done case by case. Raises UsageError with the problems of all settings."""
+    """The cases of a study whose action is done case by case (not `tradeoff` or `strategies`). Raises UsageError with
+    the problems of all settings."""
     cases: list[Case] = []
     problems: list[str] = []
     alone: dict[str, bool] = {}
@@ -111,7 +112,8 @@ def _holds_frames_alone(recording: Path) -> bool:
 
 
 def require_simulated(config: RigConfig) -> None:
-    """Raise UsageError unless a rig is simulated, as fast as it can be: a case must not depend on the time of day."""
+    """Raise UsageError unless a rig is simulated and runs on virtual time: a case must not depend on the time of
+    day."""
     if config.world is None:
         raise UsageError(f"{config.name} is a real rig, and cases are done on any computer; name a simulated one")
     if config.world.real_time:
