@@ -1,4 +1,4 @@
-"""The call that measures depth in other ways beside the line scan: `compare_strategies`."""
+"""The call that measures depth in other ways besides the line scan: `compare_strategies`."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -53,7 +53,7 @@ def compare_strategies(
     --strategies`).
 
     request, changes: options, as a `StrategiesRequest` or by the names of its fields:
-      `compare_strategies(strategies=["line-joint", "gray-spad"], fogs=["clear", "20m"])`. No strategy means all.
+    `compare_strategies(strategies=["line-joint", "gray-spad"], fogs=["clear", "20m"])`. No strategy means all.
     progress: called with the number of measurements done and the total.
 
     Raises UsageError, one line per problem. An interrupt ends the comparison after the last complete row, with verdict
@@ -68,7 +68,8 @@ def compare_strategies(
 
 
 def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:
-    """The measurements of a comparison as cases, and a function that writes the comparison of their results.
+    """The measurements of a comparison as cases, and a function that writes the comparison of their results into a
+    folder.
 
     The function takes None for a result that is missing. Raises UsageError as `compare_strategies` does.
     """

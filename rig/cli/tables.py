@@ -53,7 +53,7 @@ _NEXT_STEP = {
 
 
 def console(width: int | None = None) -> Console:
-    """A console that writes to stdout. In a file or a pipe nothing is wrapped, unless a width is given."""
+    """A console that writes to stdout. If stdout is a file or a pipe, nothing is wrapped, unless a width is given."""
     return Console(highlight=False, width=width or (None if sys.stdout.isatty() else WIDE))
 
 
