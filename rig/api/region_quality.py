@@ -35,8 +35,9 @@ class Region(NamedTuple):
 def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQuality:
     """Judge the depth of a flat region of a run's maps: plane, fill rate, repeatability (`rig quality`).
 
-    run: folder of a run with depth maps. region: pixels x0 to x1 - 1 of the rows y0 to y1 - 1, as four numbers or as
-    text "x0,y0,x1,y1"; None: the whole picture.
+    run: folder of a run with depth maps.
+    region: pixels x0 to x1 - 1 of the rows y0 to y1 - 1, as four numbers or as text "x0,y0,x1,y1"; None: the whole
+      picture.
 
     Raises UsageError if the run has no depth or the region is not inside the picture, DamagedRecordingError if a map's
     files cannot be read or do not fit together.

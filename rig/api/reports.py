@@ -40,12 +40,13 @@ def report(
     """Write one HTML page, which needs no other file: on a run or recording, on two of them side by side, on a
     calibration, a trade-off or a study (`rig report`).
 
-    run: the folder; for a calibration also its file. other: a second run. out: the file to write; None:
-    NAME-report.html beside the folder or file. An older report is replaced. map: number of the map that is shown; None:
-    the last one. The page names whatever is missing in a run.
+    run: the folder; for a calibration also its file.
+    other: a second run.
+    out: the file to write; None: NAME-report.html beside the folder or file. An older report is replaced.
+    map: number of the map that is shown; None: the last one.
 
-    Raises UsageError for anything other than a run, a calibration, a trade-off or a study, for a map that does not
-    exist, and if the file cannot be written or is no report.
+    The page names whatever is missing in a run. Raises UsageError for anything other than a run, a calibration, a
+    trade-off or a study, for a map that does not exist, and if `out` cannot be written or exists and is no report.
     """
     folder, second = Path(run), None if other is None else Path(other)
     kind = _kind(folder)

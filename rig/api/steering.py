@@ -26,8 +26,11 @@ SETTINGS: Final[Mapping[str, str]] = {
 class SeenMap:
     """A map that was just made, for `on_map`.
 
-    number: that of the map, from 0, over all scans of the call. left: number of maps still to come. result: depth,
-    stripes, counts. sweep: its frames and gaps. taken: `utc` of its first and last frame and `utc_uncertainty_s`.
+    number: that of the map, from 0, over all scans of the call.
+    left: number of maps still to come.
+    result: depth, stripes, counts.
+    sweep: its frames and gaps.
+    taken: `utc` of its first and last frame and `utc_uncertainty_s`.
     config: the one with which it was taken.
     """
 

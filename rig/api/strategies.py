@@ -53,7 +53,7 @@ def compare_strategies(
     --strategies`).
 
     request, changes: options, as a `StrategiesRequest` or by the names of its fields:
-    `compare_strategies(strategies=["line-joint", "gray-spad"], fogs=["clear", "20m"])`. No strategy means all.
+      `compare_strategies(strategies=["line-joint", "gray-spad"], fogs=["clear", "20m"])`. No strategy means all.
     progress: called with the number of measurements done and the total.
 
     Raises UsageError, one line per problem. An interrupt ends the comparison after the last complete row, with verdict

@@ -94,7 +94,9 @@ def record(
     """Switch the recording of a scan that was begun with `record_on_request` on or off, or ask for its state (`rig
     record`).
 
-    on: None only asks. run: folder of the scan; None: the only one that goes on in the folder `runs`.
+    on: None only asks.
+    run: folder of the scan; None: the only one that goes on in the folder `runs`.
+
     Returns once the scan has begun or ended its part; a part ends with the sweep under way. Raises UsageError if there
     is no such scan, or several, or it does not answer within five seconds, and OSError if the wish cannot be written.
     """

@@ -46,7 +46,9 @@ class RecordingSwitch:
     called from any thread, before and during the scan; only the recorder calls `take`.
 
     before: a part begins with the sweep that was under way this long before `on` was called: seconds, or text such as
-    '2 s'. Raises UsageError for text that is not a time, and for a time that is negative or not finite.
+      '2 s'.
+
+    Raises UsageError for text that is not a time, and for a time that is negative or not finite.
     """
 
     def __init__(self, before: str | float = 0.0) -> None:

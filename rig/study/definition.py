@@ -56,11 +56,15 @@ MOST_CASES: Final = 1_000_000
 class Study(BaseModel):
     """A study, as in its YAML file.
 
-    do: what is done in each case. vary: lists by setting; every combination is a case. also: further cases, each with
-    its own settings. set: settings that hold for all cases. omit: groups of settings; a combination that has all
-    settings of one group is left out. repeat, seed: each case is done `repeat` times, with the seeds seed, seed + 1,
-    ... keep: whether each case keeps its files, such as depth maps. time_limit, memory_limit: of a case. retries: how
-    often a case is done again if its process died, hung or took too much memory.
+    do: what is done in each case.
+    vary: lists by setting; every combination is a case.
+    also: further cases, each with its own settings.
+    set: settings that hold for all cases.
+    omit: groups of settings; a combination that has all settings of one group is left out.
+    repeat, seed: each case is done `repeat` times, with the seeds seed, seed + 1, ...
+    keep: whether each case keeps its files, such as depth maps.
+    time_limit, memory_limit: of a case.
+    retries: how often a case is done again if its process died, hung or took too much memory.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

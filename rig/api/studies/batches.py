@@ -65,10 +65,12 @@ class BatchResult:
 class BatchPlan:
     """The work that a study would be.
 
-    cases: number of all cases; of those in the shard, if the request names one. left: number of these that have no
-    result in `out`. workers: cases at once, on this computer. case_s: mean wall time of a case in seconds, with one
-    thread, found by trying a few. tried_s: time of each that was tried. wall_s: estimated time of all that are left, in
-    seconds.
+    cases: number of all cases, or of those in the shard if the request names one.
+    left: number of these that have no result in `out`.
+    workers: cases at once, on this computer.
+    case_s: mean wall time of a case in seconds, with one thread, found by trying a few.
+    tried_s: wall time of each that was tried, in seconds.
+    wall_s: estimated time of all that are left, in seconds.
     """
 
     cases: int
