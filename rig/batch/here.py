@@ -37,7 +37,7 @@ class Here:
         return int(self._task is None)
 
     def submit(self, task: Task) -> None:
-        """Take a task, which `wait` does."""
+        """Take a task; `wait` does it."""
         self._task = task
         self._begun += 1
 

@@ -71,7 +71,7 @@ def usual_workers(limits: Limits) -> int:
 class Pool:
     """An executor with its own processes; see `rig.batch.engine.Executor`.
 
-    workers: number of processes; None for `usual_workers`. name: begin of the names of the workers.
+    workers: number of processes; None for `usual_workers`. name: the workers are called `name` 1, `name` 2, and so on.
     """
 
     def __init__(self, workers: int | None = None, limits: Limits | None = None, name: str = "worker") -> None:

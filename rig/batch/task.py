@@ -54,8 +54,8 @@ _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. keeps: whether the
-    case writes files of its own. files: checksums of what it reads, by path."""
+    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. folder: that of
+    the batch. keeps: whether the case writes files of its own. files: checksums of what it reads, by path."""
 
     name: str
     function: str
@@ -153,7 +153,8 @@ def _keep(scratch: Path, kept: Path) -> None:
 
 
 def result_file(folder: Path, name: str) -> Path:
-    """The file of a case's result: 256 folders, since some file systems are slow with folders of very many files."""
+    """Path of the file with a case's result. There are 256 folders of them, since some file systems are slow with very
+    many files in one folder."""
     return folder / CASES / name[:2] / f"{name}.json"
 
 

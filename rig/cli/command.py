@@ -129,7 +129,8 @@ _SETTING = re.compile("`([a-z_]+)(?:=([^`]*))?`")
 
 
 def in_options(text: str) -> str:
-    """Text with the settings that it names as in Python named as options: --out, --arm, --view frames."""
+    """Text in which settings that are named as in Python, such as `arm=True`, are replaced by options, such as
+    --arm."""
 
     def option(setting: re.Match[str]) -> str:
         name, value = _OPTIONS.get(setting[1], setting[0]), (setting[2] or "").strip("'")
@@ -273,8 +274,8 @@ def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: obje
 
 
 def code_of(error: BaseException) -> int | None:
-    """Exit code for an error; None if it is one in the program itself. A disk or a memory without room counts as a
-    device."""
+    """Exit code for an error; None for an error in the program itself. A lack of disk space or memory has the code of a
+    device error."""
     from calibration.errors import CalibrationError
     from drivers.errors import DeviceError
     from rig.errors import RigError

@@ -266,7 +266,8 @@ _NOTE_CHARACTERS = 60
 
 
 def runs_table(runs: Sequence[RunEntry], without: str) -> None:
-    """Print a list of runs to stdout, one line each, in local time. `rec` before the size: with its recording.
+    """Print a list of runs to stdout, one line each, in local time. `rec` before the size says that a run has a
+    recording.
 
     without: what to print if there are none.
     """

@@ -54,7 +54,7 @@ _TEXT = 256 * 1024
 
 
 class Feed:
-    """The slot of one run, from the run's begin to the end of the `with` block.
+    """The slot of one run, from the beginning of the run to the end of the `with` block.
 
     kind: 'scan', 'replay' or 'align'. name: of the config or recording.
     Give the run `listeners(...)`. Nothing is published before the run has begun, see `Listeners.begun`.
@@ -90,7 +90,8 @@ class Feed:
         self._spad_c: dict[str, float] = {}
 
     def listeners(self, others: Listeners) -> Listeners:
-        """The listeners of a run that serve the feed and then `others`."""
+        """Listeners to give to a run. Each callback serves the feed and then calls that of `others`; `row` is the
+        feed's alone."""
         return replace(
             others,
             live=_each(self._note_progress, others.live),

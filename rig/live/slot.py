@@ -225,7 +225,7 @@ class SlotReader:
     def running() -> list[RunningSlot]:
         """All runs of this user that are going on, the newest first.
 
-        Raises UsageError if the folder of the slots is not this user's alone.
+        Raises UsageError if others than this user can enter the folder of the slots.
         """
         found = [_describe(path) for path in slots(slot_folder())]
         there = [slot for slot in found if slot is not None and process_there(slot.path, slot.pid)]
@@ -233,7 +233,8 @@ class SlotReader:
 
     @staticmethod
     def newest() -> RunningSlot | None:
-        """The run that began last, of those that are going on; None if there is none."""
+        """The run that began last, of those that are going on; None if there is none. Raises UsageError as `running`
+        does."""
         return next(iter(SlotReader.running()), None)
 
     @classmethod

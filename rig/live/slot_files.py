@@ -53,7 +53,7 @@ def require_own(seen: os.stat_result, path: Path) -> None:
 
 
 def slots(folder: Path) -> Iterator[Path]:
-    """The files of all slots in the folder, dead runs' too."""
+    """The files of all slots in the folder, including those of dead runs."""
     return folder.glob("live-*.slot")
 
 

@@ -1,8 +1,8 @@
 """Joins runs of parts of a recording into the run of the whole recording.
 
 Files of maps are moved and numbered anew. Figures of the summary are those that one run would have: sums, means over
-all maps, and the worst of all parts. Only pictures of depth are drawn anew, since the first map sets the colours of
-all.
+all maps, and the worst of all parts. Figures of stages and of the replay are left out. Only pictures of depth are drawn
+anew, since the first map sets the colours of all.
 """
 
 import shutil
@@ -59,8 +59,8 @@ def join_runs(parts: Sequence[Path], folder: RunFolder) -> tuple[Summary, dict[s
 
 
 def with_doubt(summary: Summary, reason: str, maps: Sequence[int]) -> Summary:
-    """The summary with one more reason not to trust the maps with these numbers. The verdict is then 'doubtful' or
-    graver."""
+    """The summary with one more reason not to trust the maps with these numbers. The verdict becomes 'doubtful', unless
+    it is 'unsynchronised'."""
     doubts = {doubt.reason: doubt.maps for doubt in summary.verdict_reasons}
     doubts[reason] = tuple(sorted({*doubts.get(reason, ()), *maps}))
     verdict = next(each for each in GRAVEST if each in (summary.verdict, RunVerdict.DOUBTFUL))

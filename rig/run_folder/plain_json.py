@@ -10,7 +10,8 @@ import numpy as np
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Content as strict JSON. NaN and infinity become null, arrays lists, fractions numbers, and all else text."""
+    """Content as strict JSON. NaN and infinity become null; arrays and tuples become lists, fractions become numbers.
+    Whatever else JSON does not have becomes text."""
     return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 

@@ -215,7 +215,8 @@ class TimeOfDay:
         self._starts: list[StartTimes] = []
 
     def begin(self, first_map: int) -> StartTimes:
-        """Call this just before the SPAD is told to start. first_map: number of the first map of this start."""
+        """Begin the times of a start, just before the SPAD is told to start. first_map: number of the first map of this
+        start."""
         self._starts.append(StartTimes(self._timing, time.monotonic_ns(), first_map))
         return self._starts[-1]
 

@@ -54,7 +54,7 @@ class AcquisitionRequest:
     policy: what to do with frames that come too fast.
     first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
     estimator learns from that map.
-    learns: whether the estimator learns from the first map; only named in the progress.
+    learns: whether the estimator learns from the first map; the progress then says so.
     starts: for a replay, the recorded starts with the number of sweeps of each; None lets the scan choose.
     silence_s: a SPAD that sends nothing for this long, in seconds, with the ring empty, has failed.
     recording: takes every block; None records nothing.

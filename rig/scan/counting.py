@@ -113,8 +113,8 @@ class MapQueue:
 class CountingRequest:
     """The work of one start of the SPAD.
 
-    assembler: makes `sweeps` sweeps of the blocks. maker: makes their maps. silence_s: longest silence of the SPAD.
-    on_sweep: called on the counting thread with each counted sweep before its map is made.
+    assembler: makes `sweeps` sweeps from the blocks. maker: makes their maps. silence_s: longest silence of the SPAD,
+    in seconds. on_sweep: called on the counting thread with each counted sweep before its map is made.
     """
 
     assembler: SweepAssembler

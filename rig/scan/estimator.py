@@ -78,8 +78,8 @@ def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tu
     """The state of `joint` that an earlier run kept in a file, and an empty text; or None, and why no state can be
     used.
 
-    Without a file, and for other estimators, both are empty. Raises UsageError if the file is not readable, or its
-    folder does not exist.
+    Without a file, and for other estimators, the result is None and an empty text. Raises UsageError if the file is not
+    readable, or its folder does not exist.
     """
     from rig.estimate.online_learning import LearningSetting
     from rig.estimate.row.em import path_bins

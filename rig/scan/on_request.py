@@ -98,7 +98,7 @@ class RecordedPart:
     """One part: frames first_frame to end_frame - 1 of one start of the SPAD, without those lost on the way.
 
     start: number of the start in the run, from 0. run_id: that in the headers of the part's blocks.
-    first_sweep: number of the part's first whole sweep, counted from the start of the SPAD. sweeps: number of whole
+    first_sweep: number of the part's first whole sweep; the first sweep of the start has 0. sweeps: number of whole
     sweeps.
     lost: (first, last) of each range of frames lost between the part's blocks. ended: whether no block will be added.
     """
@@ -236,8 +236,8 @@ class PartsRecording:
             self._end_part()
 
     def close(self) -> None:
-        """Wait until everything is written and end the files. Raises RecordingError if that fails. A second call does
-        nothing."""
+        """Wait until everything is written and end the files. Raises RecordingError if that fails. A second call only
+        raises the same error again."""
         self._end_part()
         self._helper.shutdown()
         with self._lock:
@@ -259,8 +259,8 @@ class PartsRecording:
         }
 
     def finish(self, manifest: Mapping[str, Any]) -> None:
-        """Write the manifest of each part, and copy the `OF_MAPS` files of its maps into its folder. Call it after
-        `close`.
+        """Write the manifest of each part, and copy the files of its maps (in the folders of `OF_MAPS`) into it. Call
+        it after `close`.
 
         manifest: that of the run. Raises RecordingError if a part cannot be completed.
         """

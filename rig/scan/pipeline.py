@@ -70,7 +70,7 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """Whether a map is being made at this moment. May be called from any thread."""
+        """Whether maps are being made while nothing is counted. May be called from any thread."""
         return self._counting.estimating
 
     @property
@@ -188,7 +188,7 @@ def require_policy(policy: Overload, info: SpadInfo) -> None:
 def ring_for(
     policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False, held: int = 0
 ) -> BlockRing:
-    """Allocate the ring between this SPAD and its readers.
+    """Allocate the ring between this SPAD and its readers; each page of its memory is written once.
 
     keeps_time: give even a SPAD that can wait a large ring, so that it rarely has to wait, as in a replay at a set
     speed.

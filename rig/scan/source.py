@@ -26,7 +26,7 @@ class Source:
     published or dropped; if it raises, the source ends.
     times: notes when frames arrive.
 
-    Its errors and the SPAD's are passed to the readers, after the blocks that came before.
+    Errors of this thread and of the SPAD are passed to the readers, after the blocks that came before.
     """
 
     def __init__(

@@ -121,5 +121,5 @@ def require_simulated(config: RigConfig) -> None:
 
 
 def kept_cases(cases: Sequence[Case], omit: Sequence[Mapping[str, Any]]) -> list[bool]:
-    """For each case, whether its labels keep it in the study."""
+    """For each case, False if its labels have all settings of a group in `omit`, else True."""
     return [not left_out(case.labels, omit) for case in cases]

@@ -63,7 +63,7 @@ class Study(BaseModel):
     omit: groups of settings; a combination that has all settings of one group is left out.
     repeat, seed: each case is done `repeat` times, with the seeds seed, seed + 1, ...
     keep: whether each case keeps its files, such as depth maps.
-    time_limit, memory_limit: of a case.
+    time_limit, memory_limit: of a case, as text such as '10 min' and '500 MB'.
     retries: how often a case is done again if its process died, hung or took too much memory.
     """
 

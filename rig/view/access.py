@@ -95,7 +95,8 @@ class Access:
         return f"spadrig-{self.port}"
 
     def url(self, name: str | None = None) -> str:
-        """The page's address with its token. name: of the computer, if not the address that it listens on."""
+        """The page's address with its token. name: host name to use; None for the IP address on which the page
+        listens."""
         host = name or self.address
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")

@@ -152,7 +152,8 @@ class Pages:
         return taken, list(self._following.values())
 
     async def serve(self, connection: "ServerConnection") -> None:
-        """Serve one page until its connection is closed. A page that sends too much, or no wish of ours, is cut off."""
+        """Serve one page until its connection is closed. A page is cut off if it sends too much, or what our page never
+        sends."""
         self._last_number += 1
         page = _Page(self._last_number, dict(self._newest))
         page.news.set()

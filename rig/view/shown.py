@@ -59,8 +59,8 @@ class ShownMap:
         return known if self.confidence is None else known & (self.confidence >= np.float32(least_confidence))
 
     def column_at(self, row: int, x: int) -> int | None:
-        """The column whose stripe is nearest to a pixel; None if the row has no stripe. Stripes that can have made the
-        depth are preferred if one is within NEAR_PX."""
+        """The column whose stripe is nearest to a pixel; None if the row has no stripe. Stripes whose confidence is
+        high enough to have made the depth are preferred, if one is within NEAR_PX."""
         x_px = self.stripe.get("x_px")
         if x_px is None or not 0 <= row < len(x_px):
             return None

@@ -46,8 +46,8 @@ class BatchResult:
     folder: Path
 
     def uninterrupted(self) -> Self:
-        """The result itself, for callers that need the whole study. Raises KeyboardInterrupt if an interrupt ended it,
-        so that it ends a loop over studies too."""
+        """The result itself, for callers that need the whole study. Raises KeyboardInterrupt if an interrupt ended the
+        study; a loop over studies then ends too."""
         if self.batch.verdict == "aborted":
             raise KeyboardInterrupt
         return self
