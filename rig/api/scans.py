@@ -120,14 +120,15 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Options and checks are those of `scan`, including the room on the disk for a recording. Only `scan` finds out two
-    things: whether `out` is new or empty and can be written, and whether there is memory enough for the estimator
-    `joint` if it was named. Devices are opened, asked for their limits and closed again. Nothing moves and the laser
-    stays dark, so `arm` is not needed.
+    Options and checks are those of `scan`, including the room on the disk for a recording. Only `scan` finds out
+    whether `out` is new or empty and can be written, and whether there is memory enough for the estimator `joint` if it
+    was named. Devices are opened, asked for their limits and closed again. Nothing moves and the laser stays dark, so
+    `arm` is not needed.
 
     on_space: called with the most disk space that the recording will take, if `record` and `out` are given.
     on_estimator: called with the estimator and the reason for it, in words. For `auto` this may be a condition: only
       `scan` measures whether `joint` keeps up with a stream.
+
     Raises UsageError for a scan that cannot be made, and DevicesError (one line per device) or DeviceError if devices
     fail.
     """

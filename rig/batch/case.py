@@ -47,8 +47,8 @@ class Case:
     """A function with its inputs.
 
     function: 'package.module:name'. inputs: plain values, passed as keyword arguments. labels: what tells this case
-    from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
-    keeps: whether it writes files of its own, into a folder that it gets as the input `keep`.
+    from the others of a study, such as scene and seed, for tables. files: paths of files and folders that the function
+    reads. keeps: whether the function writes files, into a folder that it gets as the input `keep`.
 
     In inputs and files, INSTALLED stands for the folder of the program itself.
     """
@@ -154,8 +154,8 @@ def numeric_versions() -> dict[str, str]:
 
 
 def checksum(path: str) -> str:
-    """Checksum of a file, or of all files in a folder. INSTALLED may stand in its path. Raises UsageError if it cannot
-    be read.
+    """Checksum of a file, or of all files in a folder. Its path may begin with INSTALLED. Raises UsageError if it
+    cannot be read.
 
     For a recording, frame files are not read: their sizes and the index count instead. Maps that were made from it do
     not count.

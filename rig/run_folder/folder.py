@@ -157,9 +157,8 @@ class RunFolder:
         self._made_parents.clear()
 
     def publish(self) -> Path:
-        """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if that has been
-        taken meanwhile. Raises UsageError if that fails, or if files that were written have gone.
-        """
+        """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if `path` was taken
+        while the run went on. Raises UsageError if that fails, or if files that were written have gone."""
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
         try:

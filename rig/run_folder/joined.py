@@ -1,8 +1,8 @@
 """Joins runs of parts of a recording into the run of the whole recording.
 
-Files of maps are moved and numbered anew. Figures of the summary are those that one run would have: sums, means over
-all maps, and the worst of all parts. Figures of stages and of the replay are left out. Only pictures of depth are drawn
-anew, since the first map sets the colours of all.
+Files of maps are moved and renumbered. Figures of the summary are those that one run would have: sums, means over all
+maps, and the worst of all parts. Figures of stages and of the replay are left out. Only pictures of depth are drawn
+again, since the first map sets the colours of all.
 """
 
 import shutil

@@ -217,8 +217,8 @@ def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[s
 
 
 def file_crc32(path: Path) -> int:
-    """CRC-32 of a file, for the manifest. Raises OSError, also for anything but a file, such as a pipe without an
-    end."""
+    """CRC-32 of a file, for the manifest. Raises OSError if it cannot be read, or is something else, such as a pipe,
+    which may have no end."""
     if path.exists() and not path.is_file():
         raise OSError(f"{path.name} is no file")
     crc = 0

@@ -145,7 +145,7 @@ class PartsRecording:
 
     folder: the run's. keep_blocks: number of newest blocks to hold while the switch is off; they take held_bytes.
     manifest: returns what is known of the run so far, for the manifest of a part.
-    write_inputs: writes the files that have to lie beside the frames.
+    write_inputs: writes the files that belong beside the frames.
     Raises UsageError if held blocks would take more than half of the memory, or the folder cannot be written.
     """
 

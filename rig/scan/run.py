@@ -110,7 +110,7 @@ class Run:
 
         manifest: gives what is known so far; it is on the disk before this returns, and written again with each start
           of the SPAD.
-        write_inputs: writes the files that have to lie beside the frames.
+        write_inputs: writes the files that belong beside the frames.
         space: the most room that frames and maps will take.
         Raises UsageError if the disk has less room or files beside the frames cannot be written, RecordingError if the
         recording itself cannot be.
@@ -185,7 +185,7 @@ class Run:
             gc.collect()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map. If an error or interrupt comes meanwhile, the map counts completely or not at all. Raises
+        """Take the next map. If an error or interrupt comes in between, the map counts completely or not at all. Raises
         UsageError if the map cannot be written."""
         index = self.tally.maps
         before = self._last

@@ -70,7 +70,7 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
 
 
 def study_report(folder: Path) -> str:
-    """The HTML page on a study's folder. Raises UsageError if there is no study, or no case is done or has failed."""
+    """The HTML page on a study's folder. Raises UsageError if there is no study, or no case has ended yet."""
     rows = list(read_rows(folder))
     failures = read_failures(*failure_files(folder))
     if not rows and not failures:

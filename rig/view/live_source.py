@@ -63,7 +63,7 @@ class LiveSource:
         """Look for news, and attach to the newest run if none is followed. maps: if False, maps and frames are left for
         later, unless the run is over.
 
-        Call it at least twice a second, or the run takes it that nobody watches. Raises UsageError if others can enter
+        Call it at least twice a second, or the run assumes that nobody watches. Raises UsageError if others can enter
         the folder of the slots.
         """
         if self._reader is None:
