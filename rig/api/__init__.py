@@ -13,7 +13,7 @@ if the views give no calibration (its subclass Degenerate, with `.reason`, if mo
 UsageError for a request that cannot be met, and DeviceError or DevicesError if devices fail. Views taken before the
 error are in `out`.
 
-A call is imported when it is first used, so that one that only reads a list of runs need not wait for the kernels.
+Each call is imported when it is first used. So a program that only lists runs does not wait for the compiled code.
 """
 
 from importlib import import_module

@@ -25,12 +25,12 @@ _OF_THE_RUN = ("out", "note", "tags", "arm")
 def repeat(run: PathLike) -> tuple[RigConfig, ScanRequest]:
     """Config and request of a scan, to be made again as it was: `scan(*repeat("runs/fog"))` (`rig scan --like RUN`).
 
-    All settings and the seed are those of the run, also the estimator that `auto` chose. Folder, note, tags and `arm`
-    are not: they belong to one run. The calibration is the recording's own if the run was recorded and the file that
-    the config names is gone or has changed; otherwise a changed calibration is used, with a warning.
+    All settings and the seed are those of the run, including the estimator that `auto` chose. Folder, note, tags and
+    `arm` are not: they belong to one run. If the calibration file that the config names is gone or has changed, the
+    copy in the run's folder is used, if the run was recorded. Otherwise the file is used as it is now, with a warning.
 
-    Raises UsageError if there is no scan, or its config means nothing to this version; DamagedRecordingError if the
-    run's manifest is damaged.
+    Raises UsageError if there is no scan, or this version cannot read its config; DamagedRecordingError if the run's
+    manifest is damaged.
     """
     folder = Path(run)
     manifest = read_manifest(folder)

@@ -23,8 +23,8 @@ REPLAY: Final = "replay"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstration:
-    """The two runs of a demonstration, in its folders RECORDING and REPLAY. same: whether the replay's depth maps are
-    those of the recorded scan, bit for bit."""
+    """The two runs of a demonstration, in the folders `recording` and `replay` of `folder`. same: whether the replay's
+    depth maps are those of the recorded scan, bit for bit."""
 
     folder: Path
     recorded: RunResult

@@ -25,7 +25,8 @@ may round a light level differently, and then some photons fall elsewhere: the r
 
 @dataclass(frozen=True, slots=True)
 class ExampleRecording:
-    """The recording in `folder`. sha256: digest of its frames. as_published: whether that is SHA256."""
+    """The recording in `folder`. bytes: size of all its files. sha256: digest of its frames. as_published: whether that
+    is SHA256, the digest that the documentation states."""
 
     folder: Path
     frames: int

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 def runs(folder: "PathLike" = "runs", request: RunsRequest | None = None, **changes: Any) -> list[RunEntry]:
     """List the runs in a folder and up to three levels below it, the oldest first (`rig runs`).
 
-    request, changes: filters, as a `RunsRequest` or by the names of its fields: `runs("runs", tags=["fog"])`. A run
-    with damaged files is listed with the verdict 'damaged' and its `problem`. Raises UsageError for a folder that is
-    not there and for filters that cannot be read.
+    request, changes: filters, as a `RunsRequest` or by the names of its fields: `runs("runs", tags=["fog"])`.
+
+    A run with damaged files is listed with the verdict 'damaged' and its `problem`. Raises UsageError for a folder that
+    does not exist and for filters that cannot be read.
     """
     return list_runs(Path(folder), replace(request or RunsRequest(), **changes))

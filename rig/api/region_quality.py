@@ -16,7 +16,7 @@ from rig.run_folder.pictures import ply_points
 
 
 class Region(NamedTuple):
-    """Pixels x0 to before x1 of the rows y0 to before y1 of the camera."""
+    """A part of the camera's picture: pixels x0 to x1 - 1 of the rows y0 to y1 - 1."""
 
     x0: int
     y0: int
@@ -35,11 +35,12 @@ class Region(NamedTuple):
 def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQuality:
     """Judge the depth of a flat region of a run's maps: plane, fill rate, repeatability (`rig quality`).
 
-    run: folder of a run with depth maps. region: pixels x0 to before x1 of the rows y0 to before y1, as numbers or as
-    text "x0,y0,x1,y1"; None: the whole image.
+    run: folder of a run with depth maps.
+    region: pixels x0 to x1 - 1 of the rows y0 to y1 - 1, as four numbers or as text "x0,y0,x1,y1"; None: the whole
+      picture.
 
-    Raises UsageError if the run has no depth or the region is not inside the image, DamagedRecordingError if a map's
-    files do not fit together.
+    Raises UsageError if the run has no depth or the region is not inside the picture, DamagedRecordingError if a map's
+    files cannot be read or do not fit together.
     """
     folder = Path(run)
     files = sorted((folder / "depth").glob("*.npy"))

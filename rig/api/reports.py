@@ -1,4 +1,4 @@
-"""The call that makes one page of a run, of two side by side, a calibration, a trade-off or a study: `report`.
+"""The call that makes one page of a run, of two runs side by side, a calibration, a trade-off or a study: `report`.
 
 Most reports are of runs, and somebody waits for them. So modules that only other reports need are imported late.
 """
@@ -25,7 +25,8 @@ _WHAT: Final = "name the folder of a run, a calibration, a trade-off or a study,
 
 @dataclass(frozen=True, slots=True)
 class ReportResult:
-    """A written report. kind: run, runs, calibration, tradeoff or study. missing: sentences on what it lacks."""
+    """A written report. kind: run, runs, calibration, tradeoff or study. missing: sentences on what the shown runs
+    lack."""
 
     file: Path
     kind: str
@@ -36,15 +37,16 @@ class ReportResult:
 def report(
     run: PathLike, other: PathLike | None = None, *, out: PathLike | None = None, map: int | None = None
 ) -> ReportResult:
-    """Write one HTML page, which needs no other file: of a run or recording, of two of them side by side, of a
-    calibration, of a trade-off, or of a study (`rig report`).
+    """Write one HTML page, which needs no other file: on a run or recording, on two of them side by side, on a
+    calibration, a trade-off or a study (`rig report`).
 
-    run: its folder; of a calibration also its file. other: a second run. out: the file to write; None: NAME-report.html
-    beside the folder or file. An older report is replaced. map: number of the map that is shown; None: the last one.
-    Whatever is missing in a run is named in the page.
+    run: the folder; for a calibration also its file.
+    other: a second run.
+    out: the file to write; None: NAME-report.html beside the folder or file. An older report is replaced.
+    map: number of the map that is shown; None: the last one.
 
-    Raises UsageError for anything else than a run, a calibration, a trade-off or a study, for a map that is not there,
-    and if the file cannot be written.
+    The page names whatever is missing in a run. Raises UsageError for anything other than a run, a calibration, a
+    trade-off or a study, for a map that does not exist, and if `out` cannot be written or exists and is no report.
     """
     folder, second = Path(run), None if other is None else Path(other)
     kind = _kind(folder)

@@ -28,7 +28,7 @@ def check_config(config: Config = SIMULATED) -> RigConfig:
 def doctor(config: Config = SIMULATED, *, out: PathLike = "runs") -> "list[Finding]":
     """Examine whether a scan could run: devices, plan, frames, markers, dark counts and disk (`rig doctor`).
 
-    The mirror moves, but no light leaves. out: folder where a scan would write.
+    The mirror moves, but the laser stays dark. out: folder where a scan would write.
     """
     from rig.devices.doctor import examine
 

@@ -59,15 +59,17 @@ def scan(
 
     request, changes: options, as a `ScanRequest` or by the names of its fields: `scan("lab", exposures=3)`.
     progress: called several times a second with frames done and frames planned.
-    live: called at the same times with a `ScanProgress`: also maps, lost frames and the figures of every thread.
-    monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a thread of its own;
-      the run never waits for it.
+    live: called at the same times with a `ScanProgress`, which also has maps, lost frames and the figures of every
+      thread.
+    monitor: called with the newest frames as a `MonitorView`, at most ten times a second and on a separate thread; the
+      run never waits for it.
     on_space: called with a `Space` before anything moves: the most disk space that the recording will take.
     on_map: called with each map, as a `SeenMap`, once it is written. It returns None, or settings for the scan of the
       maps that are left: `{"exposures": 20, "power": "10 mW"}`, keys of the config's sections `scan` and `estimate`.
-      The scan at hand then ends with this map, everything is made safe, and the next one begins in a folder of its own,
-      NAME-2 and so on; the result is that of the last, with the others in `earlier`. Settings are checked as a config
-      is, so that no power goes beyond the laser's limit. A refused one ends the call with a UsageError in one line.
+      The present scan then ends with this map, everything is made safe, and the next scan begins in a new folder,
+      NAME-2 and so on. The result is that of the last scan, with the others in `earlier`. Settings are checked as a
+      config is, so that no power goes beyond the laser's limit. A refused setting ends the call with a UsageError in
+      one line.
     switch: records parts of the scan, between its `on` and its `off`; implies `record_on_request`.
 
     Raises UsageError for a request that cannot be met, DeviceError or DevicesError if devices fail, RecordingError if
@@ -118,13 +120,15 @@ def plan_scan(
 ) -> ScanPlan:
     """Compile the plan of a scan and check it against the limits of its devices (`rig scan --dry-run`).
 
-    Options and checks are those of `scan`, including the room on the disk for a recording. Only `scan` finds out two
-    things: whether `out` is new or empty and can be written, and whether there is memory enough for the estimator
-    `joint` if it was named. Devices are opened, asked for their limits and closed again. Nothing moves and no light
-    leaves, so `arm` is not needed.
+    Options and checks are those of `scan`, including the room on the disk for a recording. Only `scan` finds out
+    whether `out` is new or empty and can be written, and whether there is memory enough for the estimator `joint` if it
+    was named. Devices are opened, asked for their limits and closed again. Nothing moves and the laser stays dark, so
+    `arm` is not needed.
 
-    on_estimator: called with the estimator and why it is used, in words. For `auto` it may state a condition: only
+    on_space: called with the most disk space that the recording will take, if `record` and `out` are given.
+    on_estimator: called with the estimator and the reason for it, in words. For `auto` this may be a condition: only
       `scan` measures whether `joint` keeps up with a stream.
+
     Raises UsageError for a scan that cannot be made, and DevicesError (one line per device) or DeviceError if devices
     fail.
     """

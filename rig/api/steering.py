@@ -26,9 +26,12 @@ SETTINGS: Final[Mapping[str, str]] = {
 class SeenMap:
     """A map that was just made, for `on_map`.
 
-    number: of the map, from 0, over all scans of the call. left: maps still to come. result: depth, stripes, counts.
-    sweep: its frames and gaps. taken: `utc` of its first and last frame and `utc_uncertainty_s`. config: with which it
-    was taken.
+    number: that of the map, from 0, over all scans of the call.
+    left: number of maps still to come.
+    result: depth, stripes, counts.
+    sweep: its frames and gaps.
+    taken: `utc` of its first and last frame and `utc_uncertainty_s`.
+    config: the one with which it was taken.
     """
 
     number: int
@@ -44,9 +47,9 @@ OnMap = Callable[[SeenMap], Mapping[str, Any] | None]
 
 
 class Steering:
-    """Asks `on_map` after each map and makes the next scan of what it says.
+    """Asks `on_map` after each map, and makes the next scan from the settings that it returns.
 
-    Whatever the callback raises ends the scan after the map at hand, which is kept.
+    If the callback raises, the scan ends after the present map, which is kept.
     """
 
     def __init__(self, on_map: OnMap | None, config: RigConfig, request: ScanRequest) -> None:
@@ -60,7 +63,7 @@ class Steering:
         self._error: BaseException | None = None
 
     def enough(self, found: AcquiredMap) -> bool:
-        """Take a map; whether the scan is to end with it."""
+        """Take a map; returns whether the scan is to end with it, although maps are left."""
         number, self._taken = self._taken, self._taken + 1
         left = self._maps - self._taken
         if self._on_map is None:
@@ -76,7 +79,7 @@ class Steering:
         return left > 0 and (self._changes is not None or self._error is not None)
 
     def next(self, result: RunResult) -> tuple[RigConfig, ScanRequest, dict[str, Any]] | None:
-        """Config, request and manifest keys of the scan that follows one with this result; None if none does.
+        """Config, request and manifest keys of the scan that follows one with this result; None if no scan follows.
 
         Raises the callback's own error, or UsageError in one line for changes that no config may have; both have a note
         that names the folder with the maps so far.
@@ -99,7 +102,8 @@ class Steering:
 
 
 def changed(config: RigConfig, changes: Mapping[str, Any]) -> RigConfig:
-    """The config with these settings, by their short names. Raises UsageError in one line if they cannot be."""
+    """The config with these settings, given by their short names. Raises UsageError in one line if one is unknown or
+    not allowed."""
     unknown = [str(name) for name in changes if name not in SETTINGS]
     if unknown:
         raise UsageError(f"on_map asks for {', '.join(unknown)}, which is no setting of a scan; those are "

@@ -1,4 +1,4 @@
-"""The call that measures depth in other ways beside the line scan: `compare_strategies`."""
+"""The call that measures depth in other ways besides the line scan: `compare_strategies`."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -68,7 +68,8 @@ def compare_strategies(
 
 
 def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:
-    """The measurements of a comparison as cases, and a function that writes the comparison of their results.
+    """The measurements of a comparison as cases, and a function that writes the comparison of their results into a
+    folder.
 
     The function takes None for a result that is missing. Raises UsageError as `compare_strategies` does.
     """

@@ -1,10 +1,10 @@
-"""A case: a function, and inputs on which alone its result depends.
+"""A case: a function with all the inputs on which its result depends.
 
 A case is named by a digest of all that decides its result: the function, its inputs, the contents of the files that it
-reads, and the code, with that of installed plugins. So the same case has the same name on every computer, wherever the
-program is installed, and a result under another name is of something else. The function is called with the inputs and
-returns a mapping. What it returns under `measured`, such as times, may differ from computer to computer; everything
-else must not.
+reads, and the code of the program and of installed plugins. So the same case has the same name on every computer,
+wherever the program is installed, and a result under another name is of something else. The function is called with the
+inputs and returns a mapping. What it returns under `measured`, such as times, may differ from computer to computer;
+everything else must not.
 """
 
 import functools
@@ -47,8 +47,8 @@ class Case:
     """A function with its inputs.
 
     function: 'package.module:name'. inputs: plain values, passed as keyword arguments. labels: what tells this case
-    from the others of a study, such as scene and seed, for tables. files: paths of files and folders that it reads.
-    keeps: whether it writes files of its own, into a folder that it gets as the input `keep`.
+    from the others of a study, such as scene and seed, for tables. files: paths of files and folders that the function
+    reads. keeps: whether the function writes files, into a folder that it gets as the input `keep`.
 
     In inputs and files, INSTALLED stands for the folder of the program itself.
     """
@@ -69,14 +69,15 @@ class Case:
         return call(self.function, self.inputs)
 
     def name(self, code: str, checksums: Mapping[str, str]) -> str:
-        """The case's name. code: of `code_digest`; checksums: of all `files`."""
+        """The case's name, a digest. code: from `code_digest`. checksums: those of all `files`, by path."""
         files = {path: checksums[path] for path in self.files}
         made_of = {"function": self.function, "inputs": self.inputs, "files": files, "code": code}
         return hashlib.sha256(json_line(made_of).encode()).hexdigest()[:NAME_DIGITS]
 
 
 def call(function: str, inputs: Mapping[str, Any]) -> Result:
-    """Call a function by its name, 'package.module:name'. Raises TypeError if it returns no mapping."""
+    """Call a function by its name, 'package.module:name'. INSTALLED in the inputs is replaced by the program's folder
+    here. Raises what the function raises, and TypeError if it returns no mapping."""
     module, _, name = function.partition(":")
     given = {key: _here(value) for key, value in inputs.items()}
     result = getattr(import_module(module), name)(**given)
@@ -87,8 +88,8 @@ def call(function: str, inputs: Mapping[str, Any]) -> Result:
 
 @functools.cache
 def code_digest(package: str = "rig") -> str:
-    """Digest of our code and of the versions that matter, together with the code of all plugins and of the package of a
-    case's function.
+    """Digest of the code of this program, of all plugins and of the package of a case's function, and of the versions
+    that matter. It is computed once in each process.
 
     package: the first part of the function's name.
     """
@@ -153,11 +154,11 @@ def numeric_versions() -> dict[str, str]:
 
 
 def checksum(path: str) -> str:
-    """Checksum of a file, or of all files in a folder. INSTALLED may stand in its path. Raises UsageError if it cannot
-    be read.
+    """Checksum of a file, or of all files in a folder. Its path may begin with INSTALLED. Raises UsageError if it
+    cannot be read.
 
-    Of a recording, frames count by the sizes of their files and by the index, and maps that were made of it do not
-    count.
+    For a recording, frame files are not read: their sizes and the index count instead. Maps that were made from it do
+    not count.
     """
     top = Path(_here(path))
     try:
@@ -184,7 +185,11 @@ _known: dict[str, tuple[list[tuple[str, int, int]], str]] = {}
 
 
 def changed_file(files: Mapping[str, str]) -> str | None:
-    """The first path whose content has not the given checksum; None if all have. Unchanged files are not read again."""
+    """The first path that cannot be read or whose content does not have the given checksum; None if all have it.
+    Unchanged files are not read again.
+
+    files: checksums by path.
+    """
     for path, wanted in files.items():
         try:
             if current_checksum(path) != wanted:
@@ -195,8 +200,8 @@ def changed_file(files: Mapping[str, str]) -> str | None:
 
 
 def current_checksum(path: str) -> str:
-    """The checksum of a path, which is computed anew only if sizes or times have changed. Raises OSError or
-    UsageError."""
+    """The checksum of a path. It is computed anew only if sizes or times of files have changed since the last call.
+    Raises OSError or UsageError."""
     stats = [(str(each), each.stat()) for each in _watched(Path(_here(path)))]
     stamp = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     if _known.get(path, ([], ""))[0] != stamp:
@@ -214,6 +219,7 @@ def _watched(top: Path) -> list[Path]:
 
 def files_of(config: Mapping[str, Any], scene: str | None = None) -> tuple[str, ...]:
     """Paths of the files and folders that decide what a config means: calibration, learned state, scene and surfaces.
+    Only paths that are absolute and exist are returned.
 
     config: its content, with absolute paths. scene: used in place of the config's.
     """

@@ -2,9 +2,9 @@
 
 A case returns only its name and how it ended; results are files in a folder that all workers must see. So a worker that
 is lost takes nothing with it. One scheduler takes a few hundred tasks a second; therefore quick cases are sent in
-parcels, several cases as one task of dask. Each thread of a dask worker has a process of its own for the cases, which
-can be ended when a case hangs or takes too much memory. A worker with another version of the code, or without the
-folder, is retired as soon as it shows; its cases go to others.
+parcels, several cases as one task of dask. Each thread of a dask worker runs its cases in a separate process, which can
+be ended when a case hangs or takes too much memory. A worker with another version of the code, or without the folder,
+is retired as soon as that is noticed; its cases go to others.
 """
 
 import contextlib
@@ -69,8 +69,9 @@ _log = logging.getLogger(__name__)
 class Cluster:
     """An executor with the workers of a dask cluster; see `rig.batch.engine.Executor`.
 
-    client: the caller's own, which stays open. close: what else is to be closed. looked: called each time the workers
-    have been counted. Raises UsageError if a worker that is there already cannot do the cases.
+    client: the caller's own, which stays open. close: called once by `close`, to close what else was opened. looked:
+    called each time `workers` has counted the workers; what it raises is raised there. Raises UsageError if the client
+    cannot be used, or if a worker that is there already cannot do the cases.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class Cluster:
         return max(1, int(min(MOST_IN_PARCEL, PARCEL_S / max(self._case_s, 1e-6))))
 
     def submit(self, task: Task) -> None:
-        """Put a task into a parcel, and send that if it is full; `wait` sends it otherwise."""
+        """Put a task into a parcel, and send the parcel if it is full; otherwise `wait` sends it."""
         self._parcel.append(task)
         self._under_way += 1
         if len(self._parcel) >= self._size:
@@ -168,8 +169,8 @@ class Cluster:
         future.add_done_callback(self._ended.put)
 
     def wait(self) -> list[Ended]:
-        """Tasks that have ended; empty if none does within a moment. Raises RigError if the scheduler is gone, or all
-        workers."""
+        """Tasks that have ended; empty if none does within LOOK_S. Raises RigError if the scheduler is gone, UsageError
+        if all workers are."""
         self._require_client()
         if self._retired and not self.workers and time.monotonic() - self._with_workers_s > NO_WORKER_S:
             raise UsageError("no worker is left", *self.notes)
@@ -241,7 +242,11 @@ class Cluster:
 
 
 def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
-    """An executor for what `--cluster` names: the address of a scheduler, or a YAML file about a batch system."""
+    """An executor for what `--cluster` names: the address of a scheduler, or a YAML file that describes the jobs of a
+    batch system.
+
+    Raises UsageError if a package is missing, no scheduler answers, or the file is wrong.
+    """
     try:
         distributed = import_module("distributed")
     except ImportError as error:
@@ -265,10 +270,10 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
 
 
 class Jobs:
-    """The jobs of a batch system, kept at their number: where the time of one is over, another is asked for.
+    """The jobs of a batch system, whose number is kept: when the time of one is over, another is asked for.
 
-    dask-jobqueue itself replaces no job that has ended, so that a batch would wait for ever once all of them had. A job
-    that never had a worker is not replaced: it is still in the queue, or fails each time.
+    dask-jobqueue itself replaces no job that has ended, so that a batch would wait for ever once all of them had ended.
+    A job that never had a worker is not replaced: it is still in the queue, or fails each time.
     """
 
     def __init__(self, queue: Any, number: int) -> None:
@@ -278,7 +283,8 @@ class Jobs:
         self._worked_s: dict[str, float] = {}
 
     def renew(self) -> None:
-        """Ask for other jobs in the place of those that are over. Raises RigError if the system takes none at all."""
+        """Ask for new jobs in place of those that are over. Raises RigError if the system has taken none at all within
+        TAKEN_S."""
         now_s = time.monotonic()
         self._taken |= any(job.job_id is not None for job in list(self._queue.workers.values()))
         if not self._taken and now_s - self._begun_s > TAKEN_S:

@@ -1,7 +1,7 @@
 """Runs the cases of a store with an executor, until each has a result or has failed.
 
-The store knows which cases have a result, so an interrupted batch goes on where it stopped. On every way out the table
-is written with all results that there are.
+The store knows which cases have a result, so an interrupted batch goes on where it stopped. However a batch ends, the
+table is written with all results so far. Of several shards, only the last one writes it, once all cases have a result.
 """
 
 import contextlib
@@ -65,7 +65,8 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A case that failed. attempts: how often it was tried. command: what repeats it alone, with its messages."""
+    """A case that failed. kind: how it ended. attempts: how often it was tried. command: what repeats it alone, with
+    its messages. detail: the trace of an error, or the last output of a process."""
 
     case: str
     labels: dict[str, object]
@@ -82,12 +83,14 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Result of a batch. done: cases in the table, of `total`; run: those that were done now. workers: most at once.
+    """Result of a batch. done: cases with a result, of `total`, those of other shards included; run: those that were
+    done now. failures: of the cases tried now. wall_s: time of the batch; case_s: sum of the times of its cases.
+    workers: most at once.
 
-    verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, whose other cases are done elsewhere),
-    'stopped' (results could not be written any more, or the code has changed; `reason` says why), or 'aborted' by an
-    interrupt. packed: whether the table has been written; of several shards the last one does it. failures_file: name
-    of the file with the failures, those of a shard alone, in the batch's folder.
+    verdict: 'complete', 'failures' (some cases failed), 'part' (a shard, while other shards have not done all their
+    cases), 'stopped' (results could not be written any more, or the code has changed; `reason` says why), or 'aborted'
+    by an interrupt. packed: whether the table has been written; of several shards the last one does it. failures_file:
+    name, in the batch's folder, of the file with the failures; each shard has a file for its own.
     """
 
     done: int
@@ -115,9 +118,10 @@ def run_batch(
 ) -> Batch:
     """Do all cases that have no result yet, close the executor, and write the table.
 
-    shard: (i, n), only cases i, i + n, i + 2 n, ...; progress: called with the number of finished cases and of all.
-    command: of the whole batch, for the commands that repeat a failed case. An interrupt ends the batch, with verdict
-    'aborted'.
+    shard: (i, n), only cases i, i + n, i + 2 n, ... retries: how often a case is done again if its process died, hung
+    or took too much memory. progress: called with the number of finished cases and of all, both of this shard. command:
+    that of the whole batch, from which the commands that repeat a failed case are made. An interrupt ends the batch,
+    with verdict 'aborted'. What the executor raises is raised once the table is written.
     """
     begun = time.monotonic()
     mine = list(store.cases)[shard[0] :: shard[1]]
@@ -316,16 +320,18 @@ class _Told:
 
 
 def in_words(seconds: float) -> str:
-    """A time, in words."""
+    """A time in words, such as '12 min'."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
-    """Wall times of a few cases in seconds.
+    """Try a few cases and close the executor. Returns their wall times in seconds, without that of the first to end,
+    which loads compiled code, if there are others.
 
-    scratch: a store of all cases, in a folder that nobody needs. Raises UsageError if one of them fails.
+    scratch: a store of all cases, in a folder that nobody needs. most: number of cases tried at most. Raises UsageError
+    if one of them fails.
     """
     names = list(scratch.cases)
     # One of each part of the list, and any of it: their names are digests. With equal steps through a list that goes

@@ -37,7 +37,7 @@ class Here:
         return int(self._task is None)
 
     def submit(self, task: Task) -> None:
-        """Take a task, which `wait` does."""
+        """Take a task; `wait` does it."""
         self._task = task
         self._begun += 1
 
@@ -59,8 +59,9 @@ def do_here(cases: Sequence[Case], what: str, progress: Progress | None = None) 
 
     what: noun for a case, such as 'scan'. progress: called with the number of finished cases and of all.
 
-    Returns the results in the order of the cases, and whether an interrupt ended it; those that are missing then are
-    None. Raises what a case raises. If there is no room for results, that is logged and ends it like an interrupt.
+    Returns the results in the order of the cases, and whether the batch ended early; results that are missing then are
+    None. It ends early after an interrupt, and if there is no room for further results, which is logged. Raises what a
+    case raises, and UsageError if there is no room for any result.
     """
     with one_interrupt(), tempfile.TemporaryDirectory(prefix="spadrig-batch-") as folder:
         try:

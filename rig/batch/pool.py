@@ -1,7 +1,7 @@
 """Processes of this computer that do cases, each with one thread, limited time and limited memory.
 
-A process that dies, hangs or takes too much memory is replaced, and only its own case has failed. Sizes of memory are
-watched on Linux alone.
+A process that dies, hangs or takes too much memory is replaced, and only its own case has failed. The memory that
+processes take is watched only on Linux.
 """
 
 import contextlib
@@ -45,7 +45,8 @@ class Limits:
 
 
 def memory_bytes() -> int:
-    """This computer's memory, or the part of it that our control group, such as a job's, and those above it may use."""
+    """Memory of this computer in bytes, or less if the control group of this process, such as that of a job, or one
+    above it has a lower limit. 8 GiB where the system does not tell."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 8 << 30
     top, files = Path("/sys/fs/cgroup"), []
     with contextlib.suppress(OSError):
@@ -68,7 +69,10 @@ def usual_workers(limits: Limits) -> int:
 
 
 class Pool:
-    """An executor with processes of its own; see `rig.batch.engine.Executor`."""
+    """An executor with its own processes; see `rig.batch.engine.Executor`.
+
+    workers: number of processes; None for `usual_workers`. name: the workers are called `name` 1, `name` 2, and so on.
+    """
 
     def __init__(self, workers: int | None = None, limits: Limits | None = None, name: str = "worker") -> None:
         limits = limits or Limits()
@@ -128,7 +132,7 @@ class Pool:
         self.close()
 
     def close(self) -> None:
-        """End all processes, also those at work."""
+        """End all processes, even those at work."""
         for process in [*self._busy, *self._free]:
             process.kill()
         self._busy.clear()
@@ -221,7 +225,7 @@ class _Process:
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory of a process; 0 where the system does not tell."""
+    """Resident memory of a process in bytes; 0 where the system does not tell."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):

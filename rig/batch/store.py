@@ -54,9 +54,9 @@ class Row:
 class Store:
     """The folder of a batch, held by this process alone until `close`; with `shared`, by shards of the same batch.
 
-    cases: by name; the same case twice is done once. names: of the given cases, in their order. title: kept with the
-    versions. Raises UsageError if the folder has another batch, or one of another version of the
-    code, or if somebody else is at work in it.
+    Its attribute `cases` has the cases by name; a case that is given twice is done once. `names` has the names of the
+    given cases, in their order. title: further keys of `study.json`. Raises UsageError if the folder has another batch,
+    or one of another version of the code, if another process is at work in it, or if a file cannot be read or written.
     """
 
     def __init__(
@@ -120,8 +120,8 @@ class Store:
             self._hold(shared, begun=True)
 
     def give_up(self) -> None:
-        """Leave the folder as it was, if this store has begun it and no shard has joined: the batch is refused before
-        any case is done."""
+        """Leave the folder as it was, if this store has begun it and no shard has joined. For a batch that is refused
+        before any case is done."""
         if not self._begun or not self.alone():
             return
         with contextlib.suppress(OSError):  # another shard has results
@@ -212,7 +212,8 @@ class Store:
         return [found.get(name) for name in self.names]
 
     def pack(self) -> set[str]:
-        """Write the table with all results that there are, and return the names of their cases. Raises OSError."""
+        """Write the table with all results so far, remove the result files that are in it now, and return the names of
+        their cases. Raises OSError."""
         rows = list(self.rows())
         table = [json_line(self.head)]
         table += [json_line({CASE: row.case, "labels": row.labels, RESULT: row.result}) for row in rows]
@@ -232,9 +233,9 @@ class Store:
         return packed
 
     def alone(self) -> bool:
-        """Whether no other shard is at work in the folder; none can begin then until `close`. If there is one, it will
-        be the one that is alone. True where the file system has no locks: the table may then be written twice.
-        """
+        """Whether no other shard is at work in the folder. If True, none can begin until `close`. If False, this store
+        has given up its lock, so that the last shard finds itself alone. Always True where the file system has no
+        locks: the table may then be written twice."""
         try:
             hold(self._lock)  # gives up the shared lock, also if it fails
         except BlockingIOError:
@@ -285,7 +286,7 @@ def _results(folder: Path) -> dict[str, Path]:
 
 
 def read_failures(*files: Path) -> list[dict[str, Any]]:
-    """The cases in these files that failed, as `rig.batch.engine.Failure` has them."""
+    """The failed cases in these files, each with the keys of `rig.batch.engine.Failure`."""
     return [line for file in files for line in _lines(file)]
 
 

@@ -1,7 +1,8 @@
-"""Does one case and writes its result, on whatever computer it is. Only its name and how it ended are sent back.
+"""Does one case and writes its result, on whatever computer this is. Only the case's name and how it ended are sent
+back.
 
-A result is a small file that appears whole and only once, whoever writes it first. So nothing is lost with a worker,
-and a case that was begun twice, because a connection broke, is in the table once.
+A result is a small file that appears whole and only once; the first one written counts. So nothing is lost with a
+worker, and a case that was begun twice, because a connection broke, is in the table once.
 """
 
 import contextlib
@@ -53,8 +54,8 @@ _NO_ROOM: Final = {errno.ENOSPC, errno.EDQUOT}
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. keeps: whether the
-    case writes files of its own. files: checksums of what it reads, by path."""
+    """A case as it is sent to a worker: plain values. code: digest that the worker's code must have. folder: that of
+    the batch. keeps: whether the case writes files of its own. files: checksums of what it reads, by path."""
 
     name: str
     function: str
@@ -71,8 +72,8 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The end of a task. message: one line. detail: the trace of an error. seconds: wall time of the case; 0 if its
-    result was there already."""
+    """The end of a task. message: one line. detail: the trace of an error, or the last output of a process that died.
+    seconds: wall time of the case; 0 if its result was there already. worker: its name."""
 
     name: str
     status: Status
@@ -83,9 +84,10 @@ class Ended:
 
 
 def perform(task: Task, worker: str = "", *, raises: bool = False) -> Ended:
-    """Do a task whose result is not there yet, and write it.
+    """Do a task, unless its result is there already, and write the result.
 
-    worker: its name, for the record. raises: whether an error of the case is raised, and not the end of the task.
+    worker: its name, for the record. raises: raise an error of the case instead of returning it as the end of the task.
+    All other faults are returned, such as another version of the code or a full disk.
     """
     folder = Path(task.folder)
     if not (folder / HEAD).exists():
@@ -151,12 +153,14 @@ def _keep(scratch: Path, kept: Path) -> None:
 
 
 def result_file(folder: Path, name: str) -> Path:
-    """The file of a case's result: 256 folders, since some file systems are slow with folders of very many files."""
+    """Path of the file with a case's result. There are 256 folders of them, since some file systems are slow with very
+    many files in one folder."""
     return folder / CASES / name[:2] / f"{name}.json"
 
 
 def write_once(file: Path, text: str) -> None:
-    """Write a file that appears whole, unless it is there already. Raises OSError."""
+    """Write a file that appears whole. If it is there already, it stays, except on a file system without hard links.
+    Raises OSError."""
     file.parent.mkdir(exist_ok=True)
     scratch = file.with_name(f".{file.name}.{os.getpid()}.{secrets.token_hex(4)}{SCRATCH}")
     try:
@@ -174,7 +178,7 @@ def write_once(file: Path, text: str) -> None:
 
 
 def read_result(file: Path, name: str) -> dict[str, Any] | None:
-    """A result as it was written; None if it was torn by a loss of power, or is not there. Raises UsageError if it
+    """A result as it was written; None if it was torn by a loss of power, or does not exist. Raises UsageError if it
     cannot be read."""
     try:
         text = file.read_text(encoding="utf-8")

@@ -1,8 +1,8 @@
 """The process that does cases one after the other: `python -m rig.batch.worker`, started by `rig.batch.pool`.
 
-It reads tasks from its standard input and writes how they ended to its standard output, a line of JSON each, after an
-empty line once it is ready. When the input ends, because the process that started it is gone, it ends at once, also in
-the middle of a case.
+It reads tasks from its standard input and writes how they ended to its standard output, a line of JSON each. An empty
+line before them says that it is ready. When the input ends, because the process that started it is gone, it ends at
+once, even in the middle of a case.
 """
 
 import json

@@ -26,7 +26,8 @@ SourcesArgument = Annotated[
 
 
 def ask_at_terminal() -> "AskPerson | None":
-    """A callback that asks the person at the terminal; None if there is no terminal."""
+    """A callback that asks the person at the terminal to do something and waits for Enter; None if there is no
+    terminal."""
     if not sys.stdin.isatty():
         return None
 

@@ -95,9 +95,8 @@ def add_commands(app: typer.Typer, commands: Commands) -> None:
 
 
 def command(function: Callable[..., int | CommandResult]) -> Callable[..., None]:
-    """Wrap a command: print its answer, as JSON with the option --json; turn mistakes of the user and failures of
-    devices into lines on stderr and exit codes.
-    """
+    """Wrap a command: print its answer, as JSON with the option --json, and end with its exit code. Mistakes of the
+    user and failures of devices become lines on stderr and exit codes; errors in the program itself are raised."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -130,7 +129,8 @@ _SETTING = re.compile("`([a-z_]+)(?:=([^`]*))?`")
 
 
 def in_options(text: str) -> str:
-    """Text with the settings that it names as in Python named as options: --out, --arm, --view frames."""
+    """Text in which settings that are named as in Python, such as `arm=True`, are replaced by options, such as
+    --arm."""
 
     def option(setting: re.Match[str]) -> str:
         name, value = _OPTIONS.get(setting[1], setting[0]), (setting[2] or "").strip("'")
@@ -140,8 +140,8 @@ def in_options(text: str) -> str:
 
 
 def split_option(option: str, given: list[str] | None) -> list[str]:
-    """Split an option that may be given several times and with commas. Empty if it is not given; raises UsageError if
-    only empty values are given."""
+    """The values of an option that may be given several times and with commas, each once. Empty if the option is not
+    given; raises UsageError if only empty values are given."""
     parts = (part.strip() for value in given or () for part in value.split(","))
     named = list(dict.fromkeys(part for part in parts if part))
     if given and not named:
@@ -227,7 +227,7 @@ def _read(field: "Field[Any]", value: Any) -> Any:
 
 
 def dated(prefix: str = "") -> Path:
-    """A folder among the runs that is named after the present time."""
+    """Path of a folder in `runs` that is named after the present local time. The folder is not made."""
     return Path("runs") / datetime.now().strftime(f"{prefix}%Y%m%d-%H%M%S")
 
 
@@ -274,8 +274,8 @@ def fail(code: int, problems: Sequence[str], notes: Sequence[str], as_json: obje
 
 
 def code_of(error: BaseException) -> int | None:
-    """Exit code for an error; None if it is one in the program itself. A disk or a memory without room counts as a
-    device."""
+    """Exit code for an error; None for an error in the program itself. A lack of disk space or memory has the code of a
+    device error."""
     from calibration.errors import CalibrationError
     from drivers.errors import DeviceError
     from rig.errors import RigError
@@ -302,14 +302,15 @@ def report(result: "RunResult") -> CommandResult:
 
 
 def print_json(content: Mapping[str, Any]) -> None:
-    """Print the one JSON object of a command to stdout."""
+    """Print the one JSON object of a command to stdout, with settings named as options (`in_options`)."""
     from rig.run_folder.plain_json import json_text
 
     tell(in_options(json_text(content)))
 
 
 def show_page(*, stays: bool = False, required: bool = True) -> "subprocess.Popen[bytes] | None":
-    """Open the live page of this process's runs; None if it cannot be opened, which is said.
+    """Open the live page of this process's runs; returns its process. If the page cannot be opened, this is said on
+    stderr, and None is returned.
 
     stays: as in `start_page`. required: whether a missing package raises UsageError instead.
     """
@@ -335,13 +336,13 @@ def say(line: str) -> None:
 
 
 def tell(text: str = "", end: str = "\n") -> None:
-    """Print text to stdout."""
+    """Print text to stdout, with control characters shown as escapes (`plain`)."""
     print(plain(text), end=end)
 
 
 def plain(text: str) -> str:
-    """Text for a terminal. It may hold names and words from files and devices of strangers: characters that command a
-    terminal or turn the direction of writing are shown as their escapes, as in JSON."""
+    """Text that is safe to print on a terminal. Names and words may come from files and devices of strangers, so
+    characters that command a terminal or turn the direction of writing are replaced by their escapes, as in JSON."""
     return _COMMANDING.sub(lambda found: json.dumps(found[0])[1:-1], text)
 
 

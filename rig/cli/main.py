@@ -63,7 +63,11 @@ for _commands in (
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Entry point of `rig`; ends the process with the exit code."""
+    """Entry point of `rig`; ends the process with the exit code.
+
+    argv: arguments without the program's name; None for those of this process. Raises SystemExit. Without `argv`, the
+    process ends at once if a thread of a scan is still at work.
+    """
     if argv is None:
         _go_on_unread()
     arguments = _join_save(list(sys.argv[1:] if argv is None else argv))

@@ -1,7 +1,5 @@
-"""Commands for runs (`rig runs`) and recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import`, ...
-
-Also `rig export` and `rig replay`.
-"""
+"""Commands for runs (`rig runs`) and recordings: `rig verify`, `repair`, `info`, `cut`, `compress`, `import`, `export`,
+`replay`, ..."""
 
 import os
 import select

@@ -53,7 +53,7 @@ _NEXT_STEP = {
 
 
 def console(width: int | None = None) -> Console:
-    """A console that writes to stdout. In a file or a pipe nothing is wrapped, unless a width is given."""
+    """A console that writes to stdout. If stdout is a file or a pipe, nothing is wrapped, unless a width is given."""
     return Console(highlight=False, width=width or (None if sys.stdout.isatty() else WIDE))
 
 
@@ -266,7 +266,8 @@ _NOTE_CHARACTERS = 60
 
 
 def runs_table(runs: Sequence[RunEntry], without: str) -> None:
-    """Print a list of runs to stdout, one line each, in local time. `rec` before the size: with its recording.
+    """Print a list of runs to stdout, one line each, in local time. `rec` before the size says that a run has a
+    recording.
 
     without: what to print if there are none.
     """

@@ -1,9 +1,9 @@
 """Publishes a run in a slot: its settings, progress, newest frames and map, for viewers in other processes.
 
 The run's own threads only leave references to what they have just made. A thread of the feed looks ten times a second
-whether anybody watches, and only then copies the newest of it into the slot. While a reader follows an image row, the
+whether anybody watches, and only then copies the newest values into the slot. While a reader follows an image row, the
 feed also keeps the counts of the newest sweep, which are as large as one more sweep in memory. An error in the feed is
-logged once and ends the feed, never the run. A stop that a reader asks for goes the way of Ctrl-C.
+logged once and ends the feed, never the run. A reader may ask for the run to stop; it is then stopped as by Ctrl-C.
 """
 
 import logging
@@ -54,7 +54,7 @@ _TEXT = 256 * 1024
 
 
 class Feed:
-    """The slot of one run, from its begin to the end of the `with` block.
+    """The slot of one run, from the beginning of the run to the end of the `with` block.
 
     kind: 'scan', 'replay' or 'align'. name: of the config or recording.
     Give the run `listeners(...)`. Nothing is published before the run has begun, see `Listeners.begun`.
@@ -90,7 +90,8 @@ class Feed:
         self._spad_c: dict[str, float] = {}
 
     def listeners(self, others: Listeners) -> Listeners:
-        """The listeners of a run that serve the feed and then `others`."""
+        """Listeners to give to a run. Each callback serves the feed and then calls that of `others`; `row` is the
+        feed's alone."""
         return replace(
             others,
             live=_each(self._note_progress, others.live),
@@ -103,18 +104,18 @@ class Feed:
         )
 
     def begin(self, begun: RunBegun) -> None:
-        """Make the slot of a run, which is about to start. If it cannot be made, that is logged."""
+        """Make the slot of a run that is about to start, on the run's thread. If it cannot be made, that is logged."""
         self._safely(lambda: self._begin(begun))
 
     def show_map(self, found: AcquiredMap) -> None:
-        """Publish a map. It must not be changed afterwards."""
+        """Publish a map. The caller must not change it afterwards."""
         self._map = found
         self._map_times.append(time.monotonic())
         self._gaps += len(found.sweep.gaps)
         self._doubts |= dict.fromkeys(found.result.doubts)
 
     def show_figures(self, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Publish the figures of an alignment. The arrays must not be changed afterwards."""
+        """Publish the figures of an alignment. The caller must not change the arrays afterwards."""
         self._figures = finite(header), arrays
 
     def close(self) -> None:
@@ -331,7 +332,8 @@ def map_content(found: AcquiredMap, estimator: str) -> tuple[dict[str, Any], dic
 
 
 def row_of(volume: CountVolume, row: int) -> NDArray[np.uint16]:
-    """Counts of one row of a sweep, (columns, width or more), 0 outside the windows."""
+    """Counts of one row of a sweep, uint16 (columns, up to the last pixel of any window), 0 outside the windows. Larger
+    counts are given as 65535."""
     columns, _, window = volume.counts.shape
     counts = np.zeros((columns, int(volume.x0.max(initial=0)) + window), np.uint16)
     for column, first in enumerate(volume.x0.tolist()):
@@ -342,8 +344,11 @@ def row_of(volume: CountVolume, row: int) -> NDArray[np.uint16]:
 def row_content(
     index: int, row: int, counts: NDArray[np.uint16], begun: RunBegun
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Header and arrays of the section `row`, of map `index`. begin_px, end_px: first pixel of the search window, and
-    that after its last one; no pixel is searched where begin_px >= end_px."""
+    """Header and arrays of the section `row`, for the map with number `index`.
+
+    counts: of each column on that row. The arrays `begin_px` and `end_px` have, for each column, the first pixel of the
+    search window and the pixel after its last one; no pixel is searched where begin_px >= end_px.
+    """
     geometry = begun.geometry
     header = {"map": index, "row": row, "exposures": begun.plan.exposures}
     windows = {"begin_px": geometry.x_lo[row], "end_px": geometry.x_hi[row] + 1}
@@ -351,10 +356,11 @@ def row_content(
 
 
 def laser_content(rig: OpenRig) -> dict[str, Any]:
-    """The laser's name and what it said last, by the names of `LaserStatus`; the name alone if it has said nothing.
+    """The laser's name and its last known status, by the names of `LaserStatus`; the name alone if there is no status
+    yet.
 
-    A real laser is not asked here: the guard does so every second while it is armed. Raises DeviceError for a simulated
-    one that is closed.
+    A real laser is not asked here: the guard asks it every second while it is armed. Raises DeviceError for a simulated
+    laser that is closed.
     """
     guarded = rig.guard is not None and rig.config.laser.real_time
     status = rig.guard.laser_status if guarded and rig.guard is not None else rig.laser.status
@@ -370,8 +376,8 @@ def free_bytes(folder: Path) -> int | None:
 
 
 def interrupt() -> None:
-    """Interrupt this process's main thread as Ctrl-C does. A program that was started with Ctrl-C ignored, as shells
-    start those in the background, gets the next signal that it handles."""
+    """Interrupt this process's main thread as Ctrl-C does. If the program was started with Ctrl-C ignored, as shells
+    start programs in the background, it gets SIGTERM instead; if it handles neither, that is logged."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if callable(signal.getsignal(number)):
             main = threading.main_thread().ident
@@ -384,7 +390,7 @@ def interrupt() -> None:
 
 
 def finite(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Content for JSON, with None in the place of numbers that are not finite."""
+    """Content for JSON, with None in place of numbers that are not finite, and numpy's numbers as Python's."""
     return {str(name): _finite(item) for name, item in value.items()}
 
 

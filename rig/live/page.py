@@ -1,7 +1,7 @@
 """Starts the process that shows the runs of this one in the browser: `rig view --live`.
 
-It is a process of its own session, which gets no Ctrl-C that is meant for the run. Nothing of the viewer is imported
-here. It says on stderr where its page is.
+The process has its own session, so that it gets no Ctrl-C that is meant for the run. Nothing of the viewer is imported
+here. The process says on stderr where its page is.
 """
 
 import socket
@@ -33,10 +33,11 @@ def page_problem() -> str | None:
 
 
 def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.Popen[bytes]":
-    """Start the page and wait, READY_S at most, until a browser can open it. If it has ended by then, it said why.
+    """Start the page and wait, READY_S at most, until a browser can open it. If its process has ended by then, it has
+    said why on stderr.
 
-    stays: whether it stays after the run. Otherwise it ends with this process or its run, once no browser shows it.
-    port: None for that of `ViewRequest`. Raises UsageError if there can be no page here.
+    stays: whether the page stays after the run. Otherwise it ends once this process or its run has ended and no browser
+    shows it. port: None for that of `ViewRequest`. Raises UsageError if there can be no page here.
     """
     if (problem := page_problem()) is not None:
         raise UsageError(problem)
@@ -56,7 +57,7 @@ def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.P
 
 
 def end_page(page: "subprocess.Popen[bytes]") -> None:
-    """End a page that stays, also if a browser shows it."""
+    """End a page that stays, even if a browser shows it. Returns once its process has ended."""
     page.terminate()
     try:
         page.wait(READY_S)

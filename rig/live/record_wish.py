@@ -1,7 +1,7 @@
-"""Switching the recording of a scan from another process: two small files in the folder of the run.
+"""Switches the recording of a scan from another process, with two small files in the folder of the run.
 
-`record.state` is locked by the scan as long as it goes on, and says what the recording does. `record.wish` is written
-by `record`; a thread of the scan looks for it fifty times a second. A wish that comes to nothing does no harm.
+The scan holds a lock on `record.state` as long as it goes on, and writes there what the recording does. `record` writes
+`record.wish`; a thread of the scan looks for that file fifty times a second. A wish that is not fulfilled does no harm.
 """
 
 import json
@@ -64,7 +64,8 @@ class RecordState:
 
 @contextmanager
 def followed(folder: Path | None, switch: Switch | None) -> Iterator[None]:
-    """A context in which `record` can switch the recording of the run in this folder. Does nothing without a switch."""
+    """A context in which `record` can switch the recording of the run in this folder. Does nothing without a folder or
+    a switch. Raises OSError if the file of the state cannot be written or is locked."""
     if folder is None or switch is None:
         yield
         return
@@ -90,12 +91,14 @@ def followed(folder: Path | None, switch: Switch | None) -> Iterator[None]:
 def record(
     on: bool | None, run: str | os.PathLike[str] | None = None, *, runs: str | os.PathLike[str] = "runs"
 ) -> RecordState:
-    """Switch the recording of a scan on or off that was begun with `record_on_request`, or ask for its state
-    (`rig record`).
+    """Switch the recording of a scan that was begun with `record_on_request` on or off, or ask for its state (`rig
+    record`).
 
-    on: None only asks. run: folder of the scan; None: the only one that goes on in the folder `runs`.
-    Returns once the scan has begun or ended its part; the part ends with the sweep under way. Raises UsageError if
-    there is no such scan, or several, or it does not answer within five seconds.
+    on: None only asks.
+    run: folder of the scan; None: the only one that goes on in the folder `runs`.
+
+    Returns once the scan has begun or ended its part; a part ends with the sweep under way. Raises UsageError if there
+    is no such scan, or several, or it does not answer within five seconds, and OSError if the wish cannot be written.
     """
     folder = _only_one(Path(runs)) if run is None else Path(run)
     _require_running(folder)

@@ -1,12 +1,12 @@
-"""A file that holds the newest values of a run, mapped by the run and by any number of readers.
+"""A file that holds the newest values of a run, mapped into memory by the run and by any number of readers.
 
-The run writes and never waits; readers copy. Each section has two buffers, used by turns. `begun` is set to the number
-of a value before its first byte is written, `number` after its last one. A reader copies the buffer of `number`; the
-copy is whole if `begun` has advanced by less than 2 by then, and has the checksum that was written with it. If a writer
-dies in the middle, the last whole value remains. A reader that hangs or dies holds nothing up. Copying 5 MB takes a
-millisecond.
+The run writes and never waits; readers copy. Each section has two buffers, which are used in turn. `begun` is set to
+the number of a value before its first byte is written, `number` after its last one. A reader copies the buffer that
+belongs to `number`. The copy is whole if `begun` has advanced by less than 2 by then, and if it has the checksum that
+was written with it. If a writer dies in the middle, the last whole value remains. A reader that hangs or dies holds
+nothing up. Copying 5 MB takes a millisecond.
 
-Layout (little-endian). The first page is the only one that readers write: int64 time of the last heartbeat
+Layout (little-endian). The first page is the only one that readers write. It has four int64: time of the last heartbeat
 (CLOCK_MONOTONIC, ns), image row that a reader wants to follow, time of that wish, and whether a stop is requested. The
 second page has whether the run is over, then 64 bytes for each section with `begun` and `number`. Then come the length
 of the description and the description as JSON, then the buffers. The file is sparse: while nobody watches, the buffers
@@ -66,7 +66,8 @@ class RunningSlot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Value:
-    """A value of a section. number: it counts the section's values from 1. The arrays are copies, read-only."""
+    """A value of a section. number: the first value of the section has 1, the next one 2, and so on. The arrays are
+    read-only copies."""
 
     number: int
     header: dict[str, Any]
@@ -74,9 +75,9 @@ class Value:
 
 
 class SlotWriter:
-    """The run's side of a slot, a context manager; at its end the file is removed. Make one with `create`.
+    """The run's side of a slot, a context manager that removes the file at its end. Make one with `create`.
 
-    Several threads may write; one waits while another copies.
+    Several threads may write; while one copies, the others wait.
     """
 
     def __init__(self, path: Path, fd: int, described: Mapping[str, Any]) -> None:
@@ -100,8 +101,9 @@ class SlotWriter:
     def create(cls, kind: str, name: str, capacities: Mapping[str, int]) -> Self:
         """Make the slot of a run of this process. Slots that dead processes left are removed.
 
-        capacities: of each section, the most bytes of a value, its header as JSON included.
-        Raises UsageError if the folder is not this user's alone, OSError if the file cannot be made.
+        capacities: for each section, the most bytes of a value, including its header as JSON.
+        Raises UsageError if others than this user can enter the folder, OSError if the file cannot be made, ValueError
+        for too many sections or too long a name.
         """
         if len(capacities) > _MOST_SECTIONS:
             raise ValueError(f"{len(capacities)} sections; a slot has room for {_MOST_SECTIONS}")
@@ -132,12 +134,12 @@ class SlotWriter:
 
     @property
     def watched(self) -> bool:
-        """Whether a reader gave its heartbeat within WATCHED_S."""
+        """Whether a reader has called `touch` within the last WATCHED_S."""
         return _recent(int(self._control[_BEAT]))
 
     @property
     def wanted_row(self) -> int | None:
-        """Image row that the last asker follows; None if nobody asked within WATCHED_S. It may be beyond the image."""
+        """Image row that a reader asked for last; None if nobody asked within WATCHED_S. It may be beyond the image."""
         return int(self._control[_ROW]) if _recent(int(self._control[_ROW_BEAT])) else None
 
     @property
@@ -146,10 +148,10 @@ class SlotWriter:
         return bool(self._control[_STOP])
 
     def write(self, section: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Put a value in the place of the section's older one. Does nothing once the slot is closed.
+        """Replace the value of a section. Does nothing once the slot is closed.
 
-        Raises ValueError for a value above the section's capacity or a header that is no JSON, OSError if there is no
-        memory for the section.
+        Raises KeyError for an unknown section, ValueError for a value above the section's capacity or a header that is
+        no JSON, OSError if there is no memory for the section.
         """
         _, _, room = self._sections[section]
         plain = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
@@ -209,8 +211,8 @@ class SlotWriter:
 
 
 class SlotReader:
-    """A reader's side of a slot, a context manager. Make one with `open`. What was written stays readable after the
-    run's end."""
+    """A reader's side of a slot, a context manager. Make one with `open`. What was written stays readable after the end
+    of the run, until `close`."""
 
     def __init__(self, path: Path, fd: int) -> None:
         self.slot, self._sections = _read_description(fd, path)
@@ -223,7 +225,7 @@ class SlotReader:
     def running() -> list[RunningSlot]:
         """All runs of this user that are going on, the newest first.
 
-        Raises UsageError if the folder of the slots is not this user's alone.
+        Raises UsageError if others than this user can enter the folder of the slots.
         """
         found = [_describe(path) for path in slots(slot_folder())]
         there = [slot for slot in found if slot is not None and process_there(slot.path, slot.pid)]
@@ -231,12 +233,14 @@ class SlotReader:
 
     @staticmethod
     def newest() -> RunningSlot | None:
-        """The run that began last, of those that are going on; None if there is none."""
+        """The run that began last, of those that are going on; None if there is none. Raises UsageError as `running`
+        does."""
         return next(iter(SlotReader.running()), None)
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open a slot. Raises UsageError if it is none, or not this user's alone; OSError if it cannot be opened."""
+        """Open a slot. Raises UsageError if the file is no slot, or if others can use it; OSError if it cannot be
+        opened."""
         fd = open_own(path, os.O_RDWR)
         try:
             return cls(path, fd)
@@ -245,7 +249,7 @@ class SlotReader:
 
     @property
     def alive(self) -> bool:
-        """Whether the run is still going on: its process is there and has not closed the slot."""
+        """Whether the run is still going on: its process exists and has not closed the slot."""
         return not self._words[0] and process_there(self.slot.path, self.slot.pid)
 
     @property
@@ -269,7 +273,7 @@ class SlotReader:
         return None
 
     def touch(self, row: int | None = None) -> None:
-        """Tell the run that somebody watches, at least twice a second. row: image row to follow, if any."""
+        """Tell the run that somebody watches. Call it at least twice a second. row: image row to follow, if any."""
         now = time.monotonic_ns()
         if row is not None:
             self._control[_ROW] = row

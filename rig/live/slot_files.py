@@ -1,7 +1,7 @@
-"""Files of slots: their private folder, their names, and whether the process of one is still there.
+"""Files of slots: their private folder, their names, and whether the process that made one still exists.
 
-A slot is `live-PID-N.slot`. Its writer holds the file's lock (`rig.run_folder.disk.hold`) as long as it lives, so
-that nobody mistakes a dead run's slot for a running one, even where the process number is in use again.
+A slot is `live-PID-N.slot`. Its writer holds the file's lock (`rig.run_folder.disk.hold`) as long as it lives, so that
+nobody mistakes a dead run's slot for a running one, even where the process number is in use again.
 """
 
 import os
@@ -38,7 +38,8 @@ def slot_folder() -> Path:
 
 
 def require_own(seen: os.stat_result, path: Path) -> None:
-    """Raise UsageError if a file or folder belongs to another user or can be used by one."""
+    """Raise UsageError if a file or folder belongs to another user or can be used by one. seen: what `stat` says of
+    `path`."""
     problem = ""
     if not (stat.S_ISDIR(seen.st_mode) or stat.S_ISREG(seen.st_mode)):
         problem = "is neither a folder nor a file"
@@ -52,12 +53,13 @@ def require_own(seen: os.stat_result, path: Path) -> None:
 
 
 def slots(folder: Path) -> Iterator[Path]:
-    """The files of all slots in the folder, dead runs' too."""
+    """The files of all slots in the folder, including those of dead runs."""
     return folder.glob("live-*.slot")
 
 
 def new_file(folder: Path) -> tuple[Path, int]:
-    """Make the empty file of a new slot of this process and hold its lock; its path and descriptor. Raises OSError."""
+    """Make the empty file of a new slot of this process and lock it; returns its path and descriptor. Raises
+    OSError."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
     for number in count():
         path = folder / f"live-{os.getpid()}-{number}.slot"
@@ -74,7 +76,8 @@ def new_file(folder: Path) -> tuple[Path, int]:
 
 
 def open_own(path: Path, flags: int) -> int:
-    """Open a file that is this user's alone; its descriptor. Raises UsageError if it is not, OSError if it cannot."""
+    """Open a file that no other user can use; returns its descriptor. Raises UsageError if others can use it, OSError
+    if it cannot be opened."""
     fd = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0))
     try:
         require_own(os.fstat(fd), path)
@@ -94,7 +97,8 @@ def remove_dead(path: Path) -> None:
 
 
 def process_there(path: Path, pid: int) -> bool:
-    """Whether the process that made a slot still has it. On Windows, which has no such locks: whether it runs."""
+    """Whether the process that made a slot still holds its lock. On Windows, which has no such locks: whether process
+    `pid` runs."""
     if sys.platform != "win32":
         return is_held(path)
     import ctypes
@@ -109,6 +113,7 @@ def process_there(path: Path, pid: int) -> bool:
 
 
 def allocate(fd: int, at: int, length: int) -> None:
-    """Have the file system set pages of a sparse file aside. Raises OSError if there are none."""
+    """Have the file system set pages of a sparse file aside, where it can. Raises OSError if there is no room for
+    them."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(fd, at, length)

@@ -1,6 +1,6 @@
-"""Files that survive a kill or a loss of power, and locks that tell whether their process is still there.
+"""Files that survive a kill or a loss of power, and locks that tell whether their process is still alive.
 
-It imports nothing heavy, so that commands which only look at such files start quickly.
+The module imports nothing heavy, so that commands which only look at such files start quickly.
 """
 
 import os
@@ -19,16 +19,17 @@ reserves room with it."""
 
 
 def hold(fd: int, *, shared: bool = False) -> None:
-    """Lock an open file until it is closed; not on Windows. Raises OSError if another process holds the lock.
+    """Lock an open file until it is closed; does nothing on Windows. Raises OSError if another process holds the lock.
 
-    shared: allow other processes to hold it too, as shared.
+    shared: allow other processes to hold the lock too, if they also pass `shared`.
     """
     if fcntl is not None:
         fcntl.flock(fd, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
 
 
 def is_held(file: Path) -> bool:
-    """Whether a file is locked (`hold`). False if there is no such file, and on Windows."""
+    """Whether a file is locked (`hold`). False if there is no such file, and on Windows. Raises OSError if the file
+    cannot be opened."""
     if fcntl is None:
         return False
     try:
@@ -44,10 +45,9 @@ def is_held(file: Path) -> bool:
 
 
 def new_file(file: Path) -> BinaryIO:
-    """Open a new file to be written, in the place of one that is there. Raises OSError.
+    """Open a new file for writing, in place of an existing one. Raises OSError.
 
-    A link there is removed, not followed: a folder may come from somebody who would like to have another file
-    overwritten.
+    An existing link is removed, not followed: a folder may come from somebody who wants another file to be overwritten.
     """
     file.unlink(missing_ok=True)
     return file.open("xb")

@@ -58,11 +58,12 @@ class RunFolder:
     """Collects the outputs of a run. `publish` makes them appear as `path`; if not published or kept, they are removed.
 
     in_place: whether the outputs can be seen at `path` from the start.
-    Raises UsageError, with one line, if `path` is a file or a folder with something in it, or cannot be written.
+    Raises UsageError, with one line, if `path` is a file or a folder that is not empty, or if it cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, in_place: bool = False) -> None:
-        """Claim the folder. Nothing is visible at `path` yet, or an empty folder if it grows in place."""
+        """Claim the folder. If it grows in place it now exists, with a hidden file; else nothing is visible at `path`
+        yet."""
         self.path = Path(path).absolute()
         self._in_place = in_place
         self._limits: tuple[float, float] | None = None
@@ -89,7 +90,8 @@ class RunFolder:
         self.discard()
 
     def write_map(self, index: int, result: MapResult, rays: Rays | None) -> None:
-        """Write all files of one map. rays: (u, v) of the camera, None for an uncalibrated rig (no depth, no cloud).
+        """Write all files of one map. rays: (u, v) of the camera; None for an uncalibrated rig, without depth,
+        confidence and cloud.
 
         If a file cannot be written (disk full), the map's other files are removed too, and UsageError says why.
         """
@@ -155,9 +157,8 @@ class RunFolder:
         self._made_parents.clear()
 
     def publish(self) -> Path:
-        """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if that has been
-        taken meanwhile. Raises UsageError if that fails, or if files that were written have gone.
-        """
+        """Make the folder appear and return its path: `path`, or a name with -2, -3, ... added if `path` was taken
+        while the run went on. Raises UsageError if that fails, or if files that were written have gone."""
         scratch = self._scratch
         assert scratch is not None, "a run folder is published once"
         try:

@@ -1,8 +1,8 @@
 """Joins runs of parts of a recording into the run of the whole recording.
 
-Files of maps are moved and numbered anew. Figures of the summary are those that one run would have: sums, means over
-all maps, and the worst of all parts. Only pictures of depth are drawn anew, since the first map sets the colours of
-all.
+Files of maps are moved and renumbered. Figures of the summary are those that one run would have: sums, means over all
+maps, and the worst of all parts. Figures of stages and of the replay are left out. Only pictures of depth are drawn
+again, since the first map sets the colours of all.
 """
 
 import shutil
@@ -33,7 +33,8 @@ MOVED: Final = "depth", "confidence", "intensity", "stripe", "cloud", "learned",
 def join_runs(parts: Sequence[Path], folder: RunFolder) -> tuple[Summary, dict[str, Any]]:
     """Move all maps of the parts into a run folder; returns summary and manifest of the whole, which are not written.
 
-    parts: folders of runs, in order, each with all its maps; they are taken apart.
+    parts: folders of runs, at least one, in order, each with all its maps; they lose the files of their maps. The
+    manifest is that of the first part with the sweeps and gaps of all, and without verdict, counters and request.
     """
     first_map = 0
     limits: tuple[float, float] | None = None
@@ -58,7 +59,8 @@ def join_runs(parts: Sequence[Path], folder: RunFolder) -> tuple[Summary, dict[s
 
 
 def with_doubt(summary: Summary, reason: str, maps: Sequence[int]) -> Summary:
-    """The summary with a doubt more about some maps, by their numbers."""
+    """The summary with one more reason not to trust the maps with these numbers. The verdict becomes 'doubtful', unless
+    it is 'unsynchronised'."""
     doubts = {doubt.reason: doubt.maps for doubt in summary.verdict_reasons}
     doubts[reason] = tuple(sorted({*doubts.get(reason, ()), *maps}))
     verdict = next(each for each in GRAVEST if each in (summary.verdict, RunVerdict.DOUBTFUL))

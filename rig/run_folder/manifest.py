@@ -1,7 +1,7 @@
 """The manifest of a run, `manifest.json`. It is sealed with a checksum, since depth depends on its content.
 
-The key `crc32` (the seal) has the CRC-32 (zlib) of all other content, as JSON without spaces and with sorted keys. So
-a digit that changed on the disk is detected, but different line breaks are accepted.
+The key `crc32` (the seal) has the CRC-32 (zlib) of all other content, written as JSON without spaces and with sorted
+keys. So a digit that changed on the disk is detected, but different line breaks are accepted.
 """
 
 import json
@@ -36,7 +36,7 @@ RunGap = tuple[int, int, int]
 
 
 def package_versions(*names: str) -> dict[str, str]:
-    """Versions of installed packages, without those that have another name here, as distributions repackage some."""
+    """Versions of the named packages; those that are not installed under that name are left out."""
     return {name: text for name in names if (text := _version_of(name)) is not None}
 
 
@@ -148,7 +148,7 @@ class _Manifest(_Part):
 
 
 def sealed_text(text: str) -> str:
-    """Add the seal to a manifest in strict JSON."""
+    """The text of a manifest, which must be strict JSON, with the seal added."""
     content = json.loads(text)
     return json.dumps({**content, SEAL: manifest_crc32(content)}, indent=1, ensure_ascii=False)
 
@@ -206,7 +206,7 @@ def known_missing(manifest: Mapping[str, Any] | None) -> list[RunGap] | None:
 
 
 def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[str]]:
-    """The SPAD's own counts of a run's frames, as far as they are possible, and a line for each that is not."""
+    """The SPAD's own counts of a run's frames that have possible values, and a line for each of the others."""
     counters = {key: value for key, value in (manifest.get("counters") or {}).items() if value is not None}
     sane = {key: value for key, value in counters.items() if isinstance(value, int) and 0 <= value < MOST_RUN_FRAMES}
     return sane, [
@@ -217,7 +217,8 @@ def device_counters(manifest: Mapping[str, Any]) -> tuple[dict[str, int], list[s
 
 
 def file_crc32(path: Path) -> int:
-    """CRC-32 of a file, for the manifest. Raises OSError, also for anything that is no file, as it may have no end."""
+    """CRC-32 of a file, for the manifest. Raises OSError if it cannot be read, or is something else, such as a pipe,
+    which may have no end."""
     if path.exists() and not path.is_file():
         raise OSError(f"{path.name} is no file")
     crc = 0
@@ -255,6 +256,6 @@ def require_playable(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def manifest_crc32(content: Mapping[str, Any]) -> int:
-    """CRC-32 of a manifest, with or without its seal."""
+    """The CRC-32 that a manifest's seal must have. content: with or without the seal."""
     bare = {key: value for key, value in content.items() if key != SEAL}
     return zlib.crc32(json.dumps(bare, sort_keys=True, separators=(",", ":")).encode())

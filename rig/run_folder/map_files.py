@@ -25,7 +25,8 @@ def map_numbers(run: Path) -> list[int]:
 
 
 def read_stripe(file: Path) -> dict[str, Float32]:
-    """A stripe table's arrays, all (rows, columns). Raises OSError, and ValueError, with one line, if it is none."""
+    """A stripe table's arrays by name, all float32 (rows, columns). Raises OSError if the file cannot be read,
+    ValueError, with one line, if it is no stripe table."""
     table = load_arrays(file)
     if lacking := [name for name in _STRIPE if name not in table]:
         raise ValueError(f"{file.name} has no {', '.join(lacking)}")
@@ -35,7 +36,8 @@ def read_stripe(file: Path) -> dict[str, Float32]:
 
 
 def read_depth(file: Path) -> Float32:
-    """A depth map, (rows, width), metres, NaN where there is no estimate. Raises as `read_stripe` does."""
+    """A depth map, float32 (rows, width), metres, NaN where there is no estimate. Raises OSError and ValueError as
+    `read_stripe` does."""
     values = load_array(file)
     if values.ndim != 2 or not values.size:
         raise ValueError(f"{file.name} has the shape {values.shape}, not one of rows and columns")
@@ -43,8 +45,8 @@ def read_depth(file: Path) -> Float32:
 
 
 def read_arrays(file: Path) -> dict[str, Float32]:
-    """The arrays of another file of a map, such as confidence and standard deviation of each pixel's depth, as far as
-    the file has them. Raises as `read_stripe` does."""
+    """All arrays of another file of a map by name, as float32, such as confidence and standard deviation of each
+    pixel's depth. Their shapes are not checked. Raises OSError and ValueError as `read_stripe` does."""
     return {name: _sane(file, values) for name, values in load_arrays(file).items()}
 
 

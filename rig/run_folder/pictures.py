@@ -43,9 +43,9 @@ _DARKEST: Final[dict[Palette, int]] = {"viridis": 48, "cividis": 48, "inferno": 
 class Scale:
     """Colours of values from `bright` to `dark`, the values at the upper and the lower end of the scale.
 
-    unit: written behind the labels. absent: short name of pixels without a value. log: whether the scale is
-    logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values. steps: number
-    of different colours, of which fewer make a smaller file.
+    unit: written behind the labels. palette: the colour map. absent: short name of pixels without a value. log: whether
+    the scale is logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values.
+    steps: number of different colours; with fewer colours a PNG file is smaller.
     """
 
     bright: float
@@ -137,7 +137,7 @@ def depth_limits(depth_m: NDArray[np.float32]) -> tuple[float, float] | None:
 
 
 def depth_scale(limits: tuple[float, float] | None) -> Scale:
-    """The scale of depths between the limits of `depth_limits`: near is bright. Any scale if there are no limits."""
+    """The scale of depths between the limits of `depth_limits`: near is bright. From 0 to 1 m if limits is None."""
     near_m, far_m = limits or (0.0, 1.0)
     return Scale(near_m, far_m, "m", absent="no depth")
 
@@ -159,8 +159,9 @@ def depth_picture(depth_m: NDArray[np.float32], limits: tuple[float, float] | No
 
 
 def confidence_picture(confidence: NDArray[np.floating]) -> Picture:
-    """Confidence (rows, width) of a map's depths in colours, bright where it is certain, black where it is 0 or NaN,
-    with a scale at the right that spreads what lies close to 1."""
+    """Confidence (rows, width) of a map's depths in colours, bright where depth is certain, black where confidence is 0
+    or NaN, with the scale at the right. The scale is logarithmic in 1 - confidence, which spreads what lies close to 1.
+    """
     return CONFIDENCE_SCALE.picture(doubt(confidence))
 
 
@@ -181,9 +182,10 @@ _SHRINK: Final = 8
 def intensity_picture(intensity: NDArray[np.uint32]) -> Picture:
     """Summed counts as grey (rows, width), stretched so that objects stand out from fog.
 
-    The light of fog changes slowly over the picture and hides what is behind it in a stretch of the whole. So levels
-    are mainly compared with their surroundings. They are square roots, in which shot noise is the same in dark and
-    bright; hot pixels are replaced by the median of their neighbours.
+    The light of fog changes slowly over the picture. If the whole picture were stretched evenly, that light would hide
+    what is behind it. So each pixel is mainly compared with its surroundings. The levels compared are square roots of
+    the counts, since their shot noise is the same in dark and bright places; hot pixels are replaced by the median of
+    their neighbours.
     """
     import cv2
 
@@ -239,7 +241,8 @@ def _without_window_steps(level: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def round_values(low: float, high: float, most: int) -> list[float]:
-    """At most `most` + 1 round numbers between low and high, 1, 2 or 5 times a power of ten apart."""
+    """At most `most` + 1 round numbers between low and high, 1, 2 or 5 times a power of ten apart. low must be below
+    high."""
     rough = (high - low) / max(most, 1)
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= rough)
@@ -309,7 +312,8 @@ def ply_bytes(points: NDArray[np.void]) -> bytes:
 
 
 def ply_points(ply: bytes) -> NDArray[np.void] | None:
-    """The points, of dtype POINT, of a file that `ply_bytes` made; None if it is another one."""
+    """The points, of dtype POINT, of a file that `ply_bytes` made. None for any other file, and if a value is NaN or
+    not below `LARGEST`."""
     header, end, body = ply.partition(b"end_header\n")
     whole = bool(end) and b"binary_little_endian" in header and len(body) % POINT.itemsize == 0
     points = np.frombuffer(body, POINT) if whole else None

@@ -10,17 +10,20 @@ import numpy as np
 
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Content as strict JSON. NaN and infinity become null, arrays lists, fractions numbers, and all else text."""
+    """Content as strict JSON. NaN and infinity become null; arrays and tuples become lists, fractions become numbers.
+    Whatever else JSON does not have becomes text."""
     return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
 
 
 def json_line(content: Mapping[str, Any]) -> str:
-    """Content as `json_text` writes it, but on one line. Keys are sorted, so equal content gives equal lines."""
+    """Content as `json_text` writes it, but on one line, with a line break at its end. Keys are sorted, so equal
+    content gives equal lines."""
     return json.dumps(plain(content), sort_keys=True, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def plain(value: Any) -> Any:
-    """A value made of what JSON has; see `json_text`."""
+    """The value in types that JSON has: None, bool, int, float, text, list and dict. It is changed as in
+    `json_text`."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

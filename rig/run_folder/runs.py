@@ -31,11 +31,12 @@ VERDICTS: Final = (*(verdict.value for verdict in RunVerdict), UNFINISHED, DAMAG
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """One run of a list. Text is empty, and a number None, where the run does not say.
+    """One run of a list. A text is empty, and a number None, where the run does not say.
 
-    taken: date and time at which the run began, in UTC; the time of its newest file if it does not say. verdict: one of
-    `VERDICTS`. command: `scan`, `replay`, `reconstruct`, `cut` or `import`. scene: of a simulated rig. recorded:
-    whether its frames lie there too. bytes: size of all its files. problem: why the run is `damaged`.
+    taken: date and time at which the run began, in UTC; if the run does not say, the time of its newest file. verdict:
+    one of `VERDICTS`. command: `scan`, `replay`, `reconstruct`, `cut` or `import`. config: its name. scene: that of a
+    simulated rig. recorded: whether the frames are in the folder too. bytes: size of all its files. problem: why the
+    run is `damaged`.
     """
 
     folder: Path
@@ -55,7 +56,8 @@ class RunEntry:
 
 
 def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
-    """The runs in a folder and in those below it, the oldest first, that pass all filters of the request.
+    """The runs in a folder and up to MOST_DEPTH levels below it, the oldest first, that pass all filters of the
+    request.
 
     Raises UsageError if there is no such folder, or for a filter that cannot be read.
     """
@@ -71,9 +73,10 @@ def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
 
 
 def since_when(text: str, now: datetime) -> datetime:
-    """The moment that a text means: a date, a date and time (local unless it has an offset), or an age such as '7 d'.
+    """The moment in UTC that a text means: a date, a date and time (local unless it has an offset), or an age such as
+    '7 d'.
 
-    Raises UsageError for anything else.
+    now: the moment from which an age counts back. Raises UsageError for any other text.
     """
     try:
         return datetime.fromisoformat(text).astimezone(UTC)
@@ -157,7 +160,8 @@ def _entry(folder: Path) -> RunEntry:
 
 
 def read_summary(folder: Path) -> Mapping[str, Any]:
-    """The summary of a run; empty if there is none, as while the run goes on. Raises DamagedRecordingError."""
+    """The summary of a run; empty if there is none, as while the run goes on. Raises DamagedRecordingError if it cannot
+    be read."""
     try:
         content = parse_json((folder / SUMMARY).read_bytes())
     except FileNotFoundError:
@@ -194,7 +198,7 @@ def _whole(value: object) -> int | None:
 
 
 def label_problems(note: str | None, tags: Sequence[str]) -> list[str]:
-    """Problems with the note and the tags of a run; empty if there are none."""
+    """One line for each problem with the note and the tags of a run."""
     problems = []
     if note is not None and (len(note) > MOST_NOTE or not note.strip()):
         size = f"has {len(note)} characters" if note.strip() else "is empty"

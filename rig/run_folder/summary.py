@@ -28,12 +28,15 @@ class PipelineStats:
     """Figures of a pipeline during a run or at its end. Times are wall time in seconds; None means that there is no
     such stage.
 
-    source_fill_s: in the SPAD's `fill`, without source_wait_s. source_wait_s: there, waiting for a free ring slot.
-    ring_high_water: largest number of slots in use at one time, of ring_slots, which take ring_bytes together.
-    dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting. estimation_s: from
-    counts to map, as `SharedTime` charges it. map_wait_s: waiting for room among the maps that the caller has not taken
-    yet; map_queue is that room, and at most map_queue_high_water maps waited. recorder_s: computing checksums and
-    writing, summed over threads. monitor_updates: views shown. monitor_skipped_blocks: blocks that were not shown.
+    source_fill_s: the SPAD's `fill`, without source_wait_s. source_wait_s: waiting in `fill` for a free slot of the
+    ring.
+    ring_high_water: largest number of slots in use at one time, out of ring_slots, which take ring_bytes together.
+    dropped_blocks, dropped_frames: those that found no free slot. counting_s: binding and counting.
+    estimation_s: from counts to map, as `SharedTime` charges it.
+    map_queue: number of finished maps that may wait for the caller. map_queue_high_water: most that waited at one time.
+    map_wait_s: waiting for room among them.
+    recorder_s: computing checksums and writing, summed over threads.
+    monitor_updates: views shown. monitor_skipped_blocks: blocks that were not shown.
     """
 
     source_fill_s: float = 0.0
@@ -55,7 +58,7 @@ class PipelineStats:
     monitor_skipped_blocks: int | None = None
 
     def and_then(self, later: "PipelineStats") -> "PipelineStats":
-        """The figures of this start of the SPAD and a later one together."""
+        """The figures of the starts of the SPAD so far (these) and of a later start together."""
         joined: dict[str, Any] = {}
         for name in (each.name for each in fields(self)):
             values = [value for each in (self, later) if (value := getattr(each, name)) is not None]
@@ -83,9 +86,9 @@ class RunFrames:
 class Synchronisation:
     """The binding of a run's frames to columns: by what, and how well (see `rig.count.bind.SweepClock`).
 
-    residual_columns: largest residual of all sweeps, in columns; None if a sweep could not be checked. clock_error: the
-    one farthest from 0 of all sweeps. detection_probability: smallest of all sweeps' chances that a pattern as bright
-    as the sweep's is found; None if markers bound the frames.
+    residual_columns: largest residual of all sweeps, in columns; None if a sweep could not be checked. clock_error: of
+    all sweeps, the one farthest from 0. detection_probability: for each sweep, the chance that a blanking pattern as
+    bright as the sweep's is found; here the smallest of them. None if markers bound the frames.
     """
 
     by: Literal["markers", "blanking pattern"]
@@ -121,13 +124,13 @@ class TruthErrors:
 class Summary:
     """A run in figures. Times are in seconds, of the sensor or the computer. None means no value.
 
-    valid_fraction: share of camera pixels with depth, mean of the maps. floating_points: number of points left out of
-    a map because they float between two surfaces, mean of the maps; None if they are kept, or without depth. fog: of
-    the last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons
-    against the calibration that the user accepted. estimator_why: why the run chose this estimator; empty if it was
-    named. learned: if a file for learned states was named, whether the first map was estimated with the state in it,
-    and why if not; else empty. note, tags: given with the run, for people.
-    time: when the maps were taken, where that is known.
+    map_rate_hz: maps per second of the sensor's time. realtime_factor: the sensor's time divided by the computer's.
+    valid_fraction: share of camera pixels with depth, mean of the maps. floating_points: number of points left out of a
+    map because they float between two surfaces, mean of the maps; None if they are kept, or without depth. fog: of the
+    last map. verdict_reasons: reasons against maps, found in the maps themselves. accepted_calibration: reasons against
+    the calibration that the user accepted. estimator_why: why the run chose this estimator; empty if the user named it.
+    learned: if a file for learned states was named, whether the first map was estimated with the state in it, and why
+    if not; else empty. note, tags: given with the run, for people. time: when the maps were taken, where that is known.
     """
 
     maps: int
@@ -265,7 +268,8 @@ class MapTally:
 
 
 def over_maps(errors: Sequence[Errors]) -> Errors:
-    """Errors of several maps together: means, but for medians the median."""
+    """Errors of several maps together: the median if an error's name begins with 'median', else the mean. None if no
+    map has a value."""
     combined: dict[str, float | None] = {}
     for key in errors[0]:
         known = [value for each in errors if (value := each[key]) is not None]

@@ -2,15 +2,17 @@
 
 A frame has a tick of the device's clock, but no time of day. Two things bound it. A frame was not exposed before the
 computer asked the SPAD to start, and its exposure was over when its block arrived. So frame 0 began between the call of
-`start` and the earliest arrival, traced back by ticks; the middle is stated, with half the distance as uncertainty.
+`start` and the earliest arrival, traced back by ticks. The middle of that interval is stated, with half its length as
+uncertainty.
 
 Blocks arrive late by varying times, never early. The line below all arrivals that lies closest to them has the
-difference of the two clocks as its slope (Moon, Skelly and Towsley, INFOCOM 1999: one edge of the lower convex hull).
-It is used from `LEAST_SPAN_S` and `LEAST_ARRIVALS` on; before, the clocks may differ by `CLOCK_TOLERANCE`.
+difference of the rates of the two clocks as its slope (Moon, Skelly and Towsley, INFOCOM 1999: one edge of the lower
+convex hull). It is used from `LEAST_SPAN_S` and `LEAST_ARRIVALS` on; before that, the rates are taken to be equal
+within `CLOCK_TOLERANCE`.
 
-Arrivals are noted by the host's monotonic clock, which no step of UTC changes; UTC is read with it at the beginning and
-at the end. A step between the two is stated and added to the uncertainty. How far the host's UTC itself may be off is
-the kernel's business, and is stated beside.
+Arrivals are noted in the time of the host's monotonic clock, which no step of UTC changes. UTC is read together with
+that clock at the beginning and again later. A step of UTC between the two is stated and added to the uncertainty. The
+possible error of the host's UTC itself, as the kernel states it, is noted separately.
 """
 
 import ctypes
@@ -57,7 +59,7 @@ class HostReading(NamedTuple):
 
 
 def read_host() -> HostReading:
-    """UTC and the monotonic clock. Of a few readings it is that in which both were read closest together."""
+    """UTC and the monotonic clock. Of a few readings, the one in which both clocks were read closest together."""
     readings = []
     for _ in range(_READINGS):
         before = time.monotonic_ns()
@@ -76,7 +78,8 @@ class Arrival(NamedTuple):
 
 
 class Stamp(NamedTuple):
-    """A moment in UTC (Unix time, ns), and how far it may be off; None if nothing was exposed then."""
+    """A moment in UTC (Unix time, ns), and how far it may be off. uncertainty_s: None in virtual time, when nothing was
+    exposed."""
 
     utc_ns: int
     uncertainty_s: float | None
@@ -87,7 +90,8 @@ class Anchor:
     """The place of the frames of one start in UTC: frame 0 at `utc_ns`, the others by their period.
 
     tick: of frame 0. uncertainty_s: of frame 0; None in virtual time. rate_error: by how much a second of the device is
-    longer than one of the host, as a share; 0 where it is not measured. rate_uncertainty: how far that may be off.
+    longer than one of the host, as a share; 0 where it is not measured. rate_uncertainty: how far rate_error may be
+    off. period_s: from frame to frame, in seconds of the device.
     """
 
     run_id: int
@@ -100,7 +104,7 @@ class Anchor:
     period_s: float
 
     def of(self, frame: int) -> Stamp:
-        """The beginning of a frame's exposure."""
+        """The beginning of a frame's exposure. frame: its number in the start."""
         since_s = frame * self.period_s
         utc_ns = self.utc_ns + round(since_s * (1 + self.rate_error) * NS)
         if self.uncertainty_s is None:
@@ -112,7 +116,7 @@ class StartTimes:
     """Times of one start of the SPAD. `note` is called on the thread that fills the ring; all else on any thread.
 
     timing: of the SPAD. asked_ns: the host's monotonic time just before the SPAD was told to start. first_map: number
-    of the start's first.
+    of the first map of this start.
     """
 
     def __init__(self, timing: SpadTiming, asked_ns: int, first_map: int) -> None:
@@ -127,7 +131,7 @@ class StartTimes:
         self._every, self._in_turn = 1, 0
 
     def ask(self) -> None:
-        """Note that the SPAD is told to start now, later than was thought."""
+        """Note that the SPAD is told to start only now. This replaces `asked_ns`."""
         self.asked_ns = time.monotonic_ns()
 
     def note(self, run_id: int, frame: int, tick: int) -> None:
@@ -138,7 +142,8 @@ class StartTimes:
         self.add(arrival)
 
     def add(self, arrival: Arrival) -> None:
-        """Keep an arrival. The memory is bounded: once it is full, each of its places stands for twice as many."""
+        """Keep an arrival, unless it is of the same frame as the last one. The memory is bounded: once it is full, only
+        the quicker of two neighbours is kept, and each place takes twice as many arrivals from then on."""
         if self._arrivals and self._arrivals[-1].frame == arrival.frame:
             return
         self.pairs += 1
@@ -152,7 +157,10 @@ class StartTimes:
         self._arrivals = arrivals  # in one step: others may read meanwhile
 
     def anchor(self, scale: Scale, host: HostReading, step_s: float) -> Anchor | None:
-        """The anchor by all arrivals so far; None before the first. host, step_s: UTC, and its step meanwhile."""
+        """The anchor by all arrivals so far; None before the first.
+
+        host: a reading of the clocks. step_s: seconds by which UTC was stepped since then, added to the uncertainty.
+        """
         pairs, known = self._known
         if pairs != self.pairs:
             pairs = self.pairs
@@ -197,7 +205,7 @@ class StartTimes:
 class TimeOfDay:
     """The times of day of a run. scale: `host` for frames that are exposed while it runs, else `virtual`.
 
-    UTC is read now, and again by `content`.
+    UTC is read now, and again by `content` and `of_maps`.
     """
 
     def __init__(self, timing: SpadTiming, scale: Scale) -> None:
@@ -207,7 +215,8 @@ class TimeOfDay:
         self._starts: list[StartTimes] = []
 
     def begin(self, first_map: int) -> StartTimes:
-        """Call this just before the SPAD is told to start. first_map: number of the first map of this start."""
+        """Begin the times of a start, just before the SPAD is told to start. first_map: number of the first map of this
+        start."""
         self._starts.append(StartTimes(self._timing, time.monotonic_ns(), first_map))
         return self._starts[-1]
 
@@ -227,8 +236,11 @@ class TimeOfDay:
         }
 
     def of_maps(self, maps: Sequence[tuple[int, int, int]]) -> list[dict[str, Any]]:
-        """For each map (its number, first frame, last frame), `utc` of both and `utc_uncertainty_s`, as plain values;
-        empty for a map without an anchor."""
+        """For each map, `utc` (of its first and its last frame) and `utc_uncertainty_s` as plain values; empty for a
+        map without an anchor.
+
+        maps: number, first frame and last frame of each.
+        """
         step_s = self._step_s()
         first_maps = [start.first_map for start in self._starts]
         stamps = []
@@ -271,7 +283,7 @@ def map_content(anchor: Anchor, first_frame: int, last_frame: int) -> dict[str, 
 
 
 def read_anchors(manifest: Mapping[str, Any]) -> dict[int, Anchor]:
-    """The anchors in a manifest by the run id of the start; empty if it has none, or none that can be read."""
+    """The anchors in a manifest, by the run id of the start. Those that cannot be read are left out."""
     anchors = {}
     for start in (manifest.get("time") or {}).get("starts") or ():
         try:
@@ -294,7 +306,8 @@ def read_anchors(manifest: Mapping[str, Any]) -> dict[int, Anchor]:
 class RecordedTimes:
     """The times of day of a recording, for its replay.
 
-    manifest: of the recording. numbers: of those of its maps that are played, in order; a loop begins with the first.
+    manifest: that of the recording; it must have the key `time`. numbers: of the recording's maps, those that are
+    played, in order. A replay in a loop begins again with the first.
     """
 
     scale: Scale = "recorded"
@@ -313,7 +326,8 @@ class RecordedTimes:
         }
 
     def of_maps(self, maps: Sequence[tuple[int, int, int]]) -> list[dict[str, Any]]:
-        """The same as `TimeOfDay.of_maps`, of what was recorded."""
+        """The values of `TimeOfDay.of_maps` as they were recorded. Of each map, only its number in the replay is
+        used."""
         return [self._of_maps[number % len(self._of_maps)] for number, _, _ in maps]
 
 
@@ -323,7 +337,8 @@ def _time_keys(sweep: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class RunTime:
-    """The time at which the maps of a run were taken: the first frame of the first, the last frame of the last, in UTC.
+    """The time at which the maps of a run were taken: the first frame of the first map and the last frame of the last,
+    in UTC.
 
     scale: as in the manifest. uncertainty_s: the larger of the two; None in virtual time.
     """
@@ -335,7 +350,7 @@ class RunTime:
 
 
 def run_time(scale: str, of_maps: Sequence[Mapping[str, Any]]) -> RunTime | None:
-    """The summary of the maps' times; None if no map has one."""
+    """The time of a run, from those of its maps (`TimeOfDay.of_maps`); None if no map has one."""
     known = [each for each in of_maps if each.get("utc")]
     if not known:
         return None
@@ -375,9 +390,9 @@ _UNSYNCHRONISED: Final = 0x0040
 
 
 def host_clock_quality() -> tuple[bool | None, float | None]:
-    """Whether the host's UTC follows a time server, and how far it may then be off in seconds, as the kernel says.
+    """Whether the host's UTC follows a time server, and how far UTC may then be off in seconds, as the kernel says.
 
-    None where it does not say, as on other systems than Linux.
+    None where the kernel does not say, as on systems other than Linux.
     """
     if not sys.platform.startswith("linux"):
         return None, None
@@ -392,12 +407,13 @@ def host_clock_quality() -> tuple[bool | None, float | None]:
 
 
 def line_below(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
-    """The line below all points that lies closest to them: the most that its height at x = 0 may be, its slope, and how
-    far that may be off.
+    """The line below all points that lies closest to them: its largest possible height at x = 0, its slope, and the
+    uncertainty of the slope.
 
     x, y: seconds, x from 0 on, at least one point. For fewer than `LEAST_ARRIVALS` points or less than `LEAST_SPAN_S`
-    of x the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it may be off by `_SLOPE_DELAYS` medians of the delays over the
-    length of the edge, unless it or this is above `CLOCK_TOLERANCE`.
+    of x the slope is 0 +- `CLOCK_TOLERANCE`. Otherwise it is that of the edge of the hull, and its uncertainty is
+    `_SLOPE_DELAYS` median delays divided by the length of the edge; if either is above `CLOCK_TOLERANCE`, the slope is
+    again 0 +- `CLOCK_TOLERANCE`.
     """
     span = max(x) - min(x)
     if span >= LEAST_SPAN_S and len(x) >= LEAST_ARRIVALS:

@@ -54,9 +54,9 @@ class AcquisitionRequest:
     policy: what to do with frames that come too fast.
     first_alone: take the first map with a separate start, so that a SPAD that cannot wait stands still while the
     estimator learns from that map.
-    learns: whether the estimator learns from the first map.
+    learns: whether the estimator learns from the first map; the progress then says so.
     starts: for a replay, the recorded starts with the number of sweeps of each; None lets the scan choose.
-    silence_s: a SPAD that sends nothing for this long, with the ring empty, has failed.
+    silence_s: a SPAD that sends nothing for this long, in seconds, with the ring empty, has failed.
     recording: takes every block; None records nothing.
     times: notes the time of day of frames; None for a replay.
     listeners: callbacks that are informed of the progress.
@@ -122,8 +122,8 @@ class Acquisition:
         """Scan; yields the maps in order. However the iteration ends, gate, laser, scanner and SPAD are made safe.
 
         Raises DeviceError if a device fails, RingOverflow if frames came too fast, RecordingError if a block cannot be
-        written; maps that are complete all the same come first. Raises DevicesError if not all devices could be made
-        safe; after another error, notes on that error say so instead.
+        written. Maps that are complete by then are yielded before the error is raised. Raises DevicesError if not all
+        devices could be made safe; if there is another error already, notes on that one say so instead.
         """
         plan = self._plan
         counter = self._maker.counter(

@@ -1,9 +1,9 @@
 """Compares what drivers sent to their devices in a replay with the recording: the commands, and when each was sent.
 
-Commands are compared byte by byte. For buffers of points the time is compared too: how much later than in the recording
-each was sent, less the median over its scan, since the host chooses when a scan begins. The host's timing also decides
-at which point a scan was stopped. So a last buffer that was sent in the replay only, or in the recording only, is not
-compared, nor how the mirror was parked.
+Commands are compared byte by byte. For buffers of points the time is compared too: how much later each was sent than in
+the recording, less the median of its scan, since the host chooses when a scan begins. The host's timing also decides at
+which point a scan was stopped. So two things are not compared: a last buffer that was sent only in the replay or only
+in the recording, and how the mirror was parked.
 """
 
 import statistics

@@ -28,9 +28,11 @@ from rig.threads import StageThread
 class AcquiredMap:
     """A map and the account of its sweep, without the counts, which are large.
 
-    column: float64 (columns,), mean fractional column of each column's frames; its own number if it has none.
-    compute_s: seconds of binding, counting and estimation, see `SharedTime`. taken: when its first and last frame were
-    taken, as in the manifest (`utc`, `utc_uncertainty_s`), by the arrivals so far; empty if it is not known.
+    column: float64 (columns,), mean fractional column of each column's frames; for a column without frames, its own
+    number.
+    compute_s: seconds of binding, counting and estimation, as `SharedTime` charges them.
+    taken: when the map's first and last frame were taken, as in the manifest (`utc`, `utc_uncertainty_s`), by the
+    arrivals so far; empty if that is not known.
     """
 
     sweep: SweepAccount
@@ -111,8 +113,8 @@ class MapQueue:
 class CountingRequest:
     """The work of one start of the SPAD.
 
-    assembler: makes `sweeps` sweeps of the blocks. maker: makes their maps. silence_s: longest silence of the SPAD.
-    on_sweep: called on the counting thread with each counted sweep before its map is made.
+    assembler: makes `sweeps` sweeps from the blocks. maker: makes their maps. silence_s: longest silence of the SPAD,
+    in seconds. on_sweep: called on the counting thread with each counted sweep before its map is made.
     """
 
     assembler: SweepAssembler

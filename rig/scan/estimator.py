@@ -35,9 +35,11 @@ TRIES = 3
 def choose_estimator(
     estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float = math.inf
 ) -> tuple[EstimateConfig, str]:
-    """Replace `auto` in the settings; returns them and the reason. Without `auto` they are unchanged, the reason empty.
+    """Replace `auto` in the settings; returns the settings and the reason of the choice. Without `auto` the settings
+    are unchanged and the reason is empty.
 
-    map_time_s: time in which a map must be made; infinite if no frame waits for it.
+    map_time_s: seconds in which a map must be made; infinite if no frame waits for it. If finite, `joint` may be timed
+    first.
     """
     if estimate.estimator != AUTO:
         return estimate, ""
@@ -73,10 +75,11 @@ def _choice(estimate: EstimateConfig, geometry: SweepGeometry, map_time_s: float
 
 
 def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tuple[RowModel | None, str]:
-    """The state of `joint` that an earlier run kept in a file and an empty text, or None and why no state can be used.
+    """The state of `joint` that an earlier run kept in a file, and an empty text; or None, and why no state can be
+    used.
 
-    The text is also empty without a file, and for other estimators. Raises UsageError if the file is not readable, or
-    its folder does not exist.
+    Without a file, and for other estimators, the result is None and an empty text. Raises UsageError if the file is not
+    readable, or its folder does not exist.
     """
     from rig.estimate.online_learning import LearningSetting
     from rig.estimate.row.em import path_bins
@@ -98,10 +101,10 @@ def kept_model(file: Path | None, estimator: str, geometry: SweepGeometry) -> tu
 
 
 def time_of_map(geometry: SweepGeometry, threads: int) -> float:
-    """Seconds from map to map of `joint` on this machine, measured on a part of the picture and scaled up.
+    """Seconds per map of `joint` on this machine while each thread makes one map, as in a stream.
 
-    Each thread makes a map, as in a stream. A run's first map, from which `joint` learns, takes longer; so do maps with
-    a halo.
+    The time is measured on a part of the picture and scaled up. A run's first map, from which `joint` learns, takes
+    longer; so do maps with a halo.
     """
     from rig.estimate.joint.joint import Joint, MapWork
     from rig.estimate.row.em import start_model

@@ -1,9 +1,9 @@
 """Information on a run while it goes on: its progress and, for a monitor, its newest frames.
 
 `Listeners` are the callbacks. The monitor is a thread that shows the newest frames at most ten times a second and never
-delays other threads. It is an optional reader of the ring, sums the frames to show and gives the block back before it
-calls the callback. A slow callback sees fewer blocks. One that raises is reported once and not called again. One that
-still hangs at the end is abandoned. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
+delays other threads. It is an optional reader of the ring: it sums the frames to show and gives the block back before
+it calls the callback. A slow callback sees fewer blocks. A callback that raises is reported once and not called again.
+One that still hangs at the end is abandoned. Summing 16 frames of 512 x 512 takes 3 to 10 ms.
 """
 
 import logging
@@ -66,15 +66,15 @@ MonitorCallback = Callable[[MonitorView], object]
 class ScanProgress:
     """Progress of a run, reported several times a second and at its end.
 
-    frames: frames received, at most frames_planned. frames_planned: number that the plan takes from the first scan
-    marker to the last.
-    lost: number of lost frames, as the SPAD counts them; for a SPAD without such a count, those that found no room in
-    the ring.
+    frames: frames received, at most frames_planned.
+    frames_planned: frames from the first scan marker to the last, by the plan.
+    lost: number of lost frames, as the SPAD counts them; if it does not count them, frames that found no room in the
+    ring.
     sweeps: number of sweeps counted so far. maps: number of maps that were asked for.
     stages: the figures of each stage so far. ring_used: slots of the ring in use at this moment.
     fog: estimate from the newest map; None before the first.
     stage: 'learning' while the estimator makes the first map and learns from it, 'estimating' while other maps are made
-      and nothing is counted; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
+    and nothing is counted; otherwise 'replaying', 'rendering' (a simulated rig on virtual time) or 'scanning'.
     """
 
     frames: int
@@ -102,10 +102,12 @@ class RunBegun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listeners:
-    """Callbacks of a run; None for no callback.
+    """Callbacks of a run; None for no callback. An error that one raises ends the run, except one of `monitor` or
+    `watched`.
 
     live: called with the progress several times a second, on the caller's thread.
-    monitor: called with the newest frames, on a separate thread, while `watched` says so; None: always.
+    monitor: called with the newest frames, on a separate thread, while `watched` returns True, or always if `watched`
+    is None.
     sweeps: called with each counted sweep before its map is made, on the counting thread.
     on_space: called with the room that a recording will take, before anything moves, once it is known to fit.
     begun: called once, on the caller's thread, before anything is compiled or moves.
@@ -139,10 +141,10 @@ NOBODY = Listeners()
 
 
 class Monitor:
-    """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` gives.
+    """Thread that shows the blocks of one start of the SPAD to `callback`, with the figures that `stats` returns.
 
-    watched: returns whether anybody looks. While nobody does, nothing is summed and no slot of the ring is occupied.
-    None: somebody always looks.
+    watched: called on this thread; returns whether anybody looks. While nobody does, nothing is summed and no slot of
+    the ring is occupied. None: somebody always looks.
     """
 
     def __init__(
@@ -213,7 +215,10 @@ class Monitor:
 
 
 def add_frames(counts: NDArray[np.unsignedinteger], block: FrameBlock, first: int, end: int) -> None:
-    """Add frames first to end - 1 of a block to `counts` (sensor height, sensor width): how often each pixel fired."""
+    """Add frames first to end - 1 of a block to `counts`, in place: how often each pixel fired.
+
+    counts: (sensor height, sensor width), of a dtype that holds the sums.
+    """
     header = block.header
     corners = np.stack([block.records["x0"], block.records["y0"]], axis=1).astype(np.int64)
     moves = np.flatnonzero(np.any(np.diff(corners[first:end], axis=0), axis=1)) + 1 + first

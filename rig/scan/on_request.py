@@ -1,12 +1,13 @@
-"""Recording that is switched on and off while a scan goes on, and that begins before it was switched on.
+"""A recording that is switched on and off while a scan goes on, and that reaches back to before it was switched on.
 
-Until it is switched on, the recorder only holds the newest blocks in the ring: those of `before_s` and of one sweep.
-Switched on, it writes from the sweep that was under way `before_s` ago, straight from the slots of the ring; switched
-off, it ends with the sweep under way. Each such part is a recording of its own in the run's folder, `part-000` and so
-on, as `rig cut` would have made of the whole. What was not recorded is listed in the run's manifest.
+Until it is switched on, the recorder only holds the newest blocks in the ring: those of `before_s` seconds and of one
+sweep. Once on, it writes straight from the slots of the ring, from the sweep that was under way `before_s` ago. Once
+off, it ends with the sweep under way. Each such part is a complete recording in the run's folder (`part-000` and so
+on), as if `rig cut` had cut it from a recording of the whole scan. The run's manifest lists the frames that were not
+recorded.
 
-The folder of the next part is prepared and the last one is closed on a thread of their own, since both sync files.
-Holding blocks copies nothing and makes nobody wait: the ring is longer by as many slots.
+A separate thread prepares the folder of the next part and closes the last one, since both wait for the disk. To hold
+blocks copies nothing and makes nobody wait: the ring has additional slots for them.
 """
 
 import logging
@@ -42,10 +43,12 @@ MOST_SHARE_OF_MEMORY: Final = 0.5
 
 class RecordingSwitch:
     """Switches the recording of a running scan on and off. Pass it to `rig.api.scan` as `switch`. `on` and `off` may be
-    called from any thread, before and during the scan; `take` is called by the recorder alone.
+    called from any thread, before and during the scan; only the recorder calls `take`.
 
     before: a part begins with the sweep that was under way this long before `on` was called: seconds, or text such as
-    '2 s'. Raises UsageError for text that is not a time, and for a time that is negative or not finite.
+      '2 s'.
+
+    Raises UsageError for text that is not a time, and for a time that is negative or not finite.
     """
 
     def __init__(self, before: str | float = 0.0) -> None:
@@ -71,17 +74,18 @@ class RecordingSwitch:
         return bool(self.parts) and not self.parts[-1].ended
 
     def on(self) -> None:
-        """Record, from `before` ago on. Does nothing if it is on already. It counts even if `off` comes at once."""
+        """Begin a part, with what came from `before` ago on. Does nothing if the switch is on already. A part is
+        recorded even if `off` is called at once."""
         self._pending = self._pending or not self._wanted
         self._wanted = True
 
     @property
     def asked(self) -> bool:
-        """Whether a part is to begin or, if one is being recorded, is to go on after the sweep under way."""
+        """Whether a part is to begin or, while one is recorded, to go on after the sweep under way."""
         return self._pending or self._wanted
 
     def take(self) -> None:
-        """Note that the part which was asked for begins. Called by the recorder."""
+        """Note that the part that was asked for begins. Called by the recorder."""
         self._pending = False
 
     def off(self) -> None:
@@ -91,10 +95,12 @@ class RecordingSwitch:
 
 @dataclass(slots=True)
 class RecordedPart:
-    """One part: frames first_frame to end_frame - 1 of a start of the SPAD, without those that were lost on the way.
+    """One part: frames first_frame to end_frame - 1 of one start of the SPAD, without those lost on the way.
 
-    start: number of the start in the run, from 0; run_id: as in its blocks. first_sweep: number, in the start, of its
-    first whole sweep; sweeps: how many whole ones. lost: (first, last) of frames lost between its blocks.
+    start: number of the start in the run, from 0. run_id: that in the headers of the part's blocks.
+    first_sweep: number of the part's first whole sweep; the first sweep of the start has 0. sweeps: number of whole
+    sweeps.
+    lost: (first, last) of each range of frames lost between the part's blocks. ended: whether no block will be added.
     """
 
     folder: Path
@@ -135,10 +141,11 @@ class _Held:
 
 
 class PartsRecording:
-    """The recording of one scan in parts; stands in the place of a `Recording`.
+    """The recording of one scan in parts; used in place of a `Recording`.
 
-    folder: of the run. keep_blocks: newest blocks to hold while it is off; they take held_bytes. manifest: gives what
-    is known of the run so far. write_inputs: writes the files that have to lie beside the frames.
+    folder: the run's. keep_blocks: number of newest blocks to hold while the switch is off; they take held_bytes.
+    manifest: returns what is known of the run so far, for the manifest of a part.
+    write_inputs: writes the files that belong beside the frames.
     Raises UsageError if held blocks would take more than half of the memory, or the folder cannot be written.
     """
 
@@ -187,7 +194,7 @@ class PartsRecording:
 
     @property
     def bytes(self) -> int:
-        """Bytes that they take."""
+        """Bytes that the blocks counted by `blocks` take."""
         return sum(recording.bytes for recording in self._recordings)
 
     @property
@@ -206,7 +213,8 @@ class PartsRecording:
         self._planned = sweeps
 
     def write_from(self, reader: RingReader) -> None:
-        """Write what the switch asks for of one start's blocks; returns after the last. Raises RecordingError."""
+        """Write those blocks of one start that the switch asks for; returns after the last block. Raises RecordingError
+        if one cannot be written."""
         held: deque[_Held] = deque()
         try:
             while (block := next_block(reader)) is not None:
@@ -228,8 +236,8 @@ class PartsRecording:
             self._end_part()
 
     def close(self) -> None:
-        """Wait until everything is written and end the files. Raises RecordingError if that fails. A second call does
-        nothing."""
+        """Wait until everything is written and end the files. Raises RecordingError if that fails. A second call only
+        raises the same error again."""
         self._end_part()
         self._helper.shutdown()
         with self._lock:
@@ -251,9 +259,10 @@ class PartsRecording:
         }
 
     def finish(self, manifest: Mapping[str, Any]) -> None:
-        """Write the manifest of each part of a run with this manifest, and copy what belongs to its maps.
+        """Write the manifest of each part, and copy the files of its maps (in the folders of `OF_MAPS`) into it. Call
+        it after `close`.
 
-        Raises RecordingError if that cannot be written.
+        manifest: that of the run. Raises RecordingError if a part cannot be completed.
         """
         try:
             self._finish_parts(manifest)

@@ -70,7 +70,7 @@ class Pipeline:
 
     @property
     def estimating(self) -> bool:
-        """Whether a map is being made at this moment. May be called from any thread."""
+        """Whether maps are being made while nothing is counted. May be called from any thread."""
         return self._counting.estimating
 
     @property
@@ -116,9 +116,11 @@ class Pipeline:
         return self._source.join(JOIN_S)
 
     def error(self) -> BaseException | None:
-        """The error that ended the drained pipeline too early, or None; waits until the recording is written.
+        """The error that ended the pipeline too early, or None. To be asked once all maps are taken; waits for the
+        recording.
 
-        If the recording is not written within DRAIN_S, the error is a RecordingError."""
+        If the recording is not written within DRAIN_S, the error is a RecordingError.
+        """
         recorder = self._recorder
         if recorder is not None and not recorder.thread.join(DRAIN_S):
             return RecordingError(
@@ -186,10 +188,11 @@ def require_policy(policy: Overload, info: SpadInfo) -> None:
 def ring_for(
     policy: Overload, info: SpadInfo, plan: ScanPlan, timing: SpadTiming, *, keeps_time: bool = False, held: int = 0
 ) -> BlockRing:
-    """Allocate the ring between this SPAD and its readers and touch its memory.
+    """Allocate the ring between this SPAD and its readers; each page of its memory is written once.
 
-    keeps_time: whether a SPAD that can wait gets a large ring, so that it rarely has to, as in a replay with a clock.
-    held: further slots, for blocks that a recording holds.
+    keeps_time: give even a SPAD that can wait a large ring, so that it rarely has to wait, as in a replay at a set
+    speed.
+    held: number of additional slots, for blocks that a recording holds.
     """
     few = info.can_wait and not keeps_time
     slots = FEWEST_SLOTS if few else min(max(RING_BYTES // timing.stride, FEWEST_SLOTS), MOST_SLOTS)

@@ -37,9 +37,9 @@ def play(
     before its first frame.
 
     If drivers take part and the recording has control traffic, what they sent is compared with that traffic once the
-    rig is closed, also after a failure. It is not compared if the recorded scan had planned another number of sweeps.
-    Times are compared only if the whole recording was played in real time. Raises DivergedError if the two differ; what
-    the run wrote is kept.
+    rig is closed. After a failure only the bytes of the commands are compared. Nothing is compared if the recorded scan
+    had planned another number of sweeps. Times are compared only if the whole recording was played in real time. Raises
+    DivergedError if there is a difference; what the run wrote is kept.
     """
     drivers = [slot for slot in RECORDED if getattr(config, slot).real_time]
     compared = bool(drivers) and (recording / CONTROL_FILE).exists()

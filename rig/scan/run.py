@@ -60,9 +60,9 @@ class RunResult:
 
 
 class Run:
-    """Takes the maps of a run one by one, writes those to be kept, and closes with manifest and summary.
+    """Takes the maps of a run one by one, writes those to be kept, and completes the folder with manifest and summary.
 
-    Leaving the context without `finish` removes everything that was written, except a recording that contains a block.
+    Leaving the context without `finish` removes everything that was written, unless a block was recorded.
 
     out: folder; None writes nothing. save: which maps are written; None for all. record: whether the folder is that of
     a recording. rays: the camera's (u, v) of every pixel, to be set before the first map; None for an uncalibrated rig.
@@ -110,7 +110,7 @@ class Run:
 
         manifest: gives what is known so far; it is on the disk before this returns, and written again with each start
           of the SPAD.
-        write_inputs: writes the files that have to lie beside the frames.
+        write_inputs: writes the files that belong beside the frames.
         space: the most room that frames and maps will take.
         Raises UsageError if the disk has less room or files beside the frames cannot be written, RecordingError if the
         recording itself cannot be.
@@ -148,8 +148,8 @@ class Run:
         manifest: Callable[[], Mapping[str, Any]],
         write_inputs: Callable[[Path], None],
     ) -> PartsRecording:
-        """Begin a recording in parts, by the run's `switch`; it is closed with the run. The arguments and errors are
-        those of `PartsRecording`."""
+        """Begin a recording in parts, which the run's `switch` turns on and off; it is closed with the run. The
+        arguments and errors are those of `PartsRecording`."""
         assert self._folder is not None, "asked for with a folder"
         assert self.switch is not None, "asked for with a switch"
 
@@ -168,9 +168,9 @@ class Run:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Remove a folder that was not finished, unless a block was recorded: 'rig repair' completes the recording.
+        """Remove a folder that was not finished, unless a block was recorded: 'rig repair' completes such a recording.
 
-        Also give back the memory of what the run used.
+        Also collect garbage, which gives back the memory of the run's ring and maps.
         """
         try:
             if self._recording is not None:
@@ -185,7 +185,7 @@ class Run:
             gc.collect()
 
     def add(self, result: MapResult, compute_s: float, truth: SweepTruth | None = None) -> None:
-        """Take the next map. If an error or interrupt comes meanwhile, the map counts completely or not at all. Raises
+        """Take the next map. If an error or interrupt comes in between, the map counts completely or not at all. Raises
         UsageError if the map cannot be written."""
         index = self.tally.maps
         before = self._last
@@ -203,8 +203,9 @@ class Run:
             raise
 
     def finish(self, summary: Summary, manifest: Mapping[str, Any]) -> RunResult:
-        """Write manifest and summary and make the folder appear. If there is no map and no recorded block, no folder is
-        left."""
+        """Write manifest and summary and make the folder appear. If there is no map and no recorded block, the result
+        has no folder. Raises UsageError if a file cannot be written, RecordingError if a recording cannot be completed.
+        """
         index, result, truth = self._last or (None, None, None)
         folder = None
         if self._folder is not None and self.worth_keeping:
@@ -256,8 +257,8 @@ def frames_of(sweeps: list[SweepAccount], crc_errors: int | None, outside: Seque
 def frames_that_came(of_maps: RunFrames, counters: SpadCounters, dropped: int) -> RunFrames:
     """Frames of a run that ended before its last map: all that came, including those after its last whole map.
 
-    of_maps: those of its whole maps. counters: the SPAD's own. dropped: frames that found no room in the ring; they
-    count as the lost ones if the SPAD does not count lost frames.
+    of_maps: those of its whole maps; `lit` and `crc_errors` stay as they are there. counters: the SPAD's own. dropped:
+    frames that found no room in the ring; they count as the lost ones if the SPAD does not count lost frames.
     """
     lost = dropped if counters.lost is None else counters.lost
     return replace(of_maps, expected=counters.delivered + lost, received=counters.delivered, lost=lost)

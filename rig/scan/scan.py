@@ -1,6 +1,6 @@
 """A scan from open devices to its folder: what happens before, while and after `acquisition` runs the devices.
 
-`run_scan` makes the plan and the `Reconstructor`, starts the recording, hands each map to its `Run`, and states at the
+`run_scan` makes the plan and the `Reconstructor`, starts the recording, hands each map to its `Run`, and reports at the
 end which frames came and which were lost. `devices_content` describes the devices for the manifest.
 """
 
@@ -65,13 +65,14 @@ def run_scan(
 ) -> RunResult:
     """Scan with an open rig; `run` takes the maps.
 
-    request: its `maps` (None: all maps in a replay, else one), `on_overload`, `record` and `accept_calibration` are
-      used; its other fields were used to open the rig and to make `run`.
+    request: its `maps` (None: all maps in a replay, else one), `on_overload`, `record`, `accept_calibration`, `note`
+    and `tags` are used; its other fields were used to open the rig and to make `run`, and are only noted in the
+    manifest.
     prepared: the result of `prepare` for this rig, if the caller has called it.
 
-    An interrupt ends the scan after its last complete map, with verdict 'aborted'. So does any error, such as one of a
-    device or for want of memory, which is raised again once the complete maps and the recording are safe; if there is
-    neither, nothing is left.
+    An interrupt ends the scan after its last complete map, with verdict 'aborted'. An error, such as one of a device or
+    a lack of memory, ends it in the same way and is raised once the complete maps and the recording are safe. If there
+    is no complete map and no recorded block, nothing is left.
     """
     policy = Overload.parse(request.on_overload)
     require_policy(policy, rig.spad.info)
@@ -224,8 +225,8 @@ def _keep_learned(estimate: EstimateConfig, state: Learned) -> None:
 class LiveFacts:
     """Facts about a live scan, for `run_scan`. `ReplayFacts` has those about a recording.
 
-    maps: number of maps that the run will take. learned: kept states to estimate the maps with, none here. starts: None
-    lets the scan choose the starts of the SPAD. silence_s: longest silence of the SPAD.
+    maps: number of maps that the run will take. learned: kept states to estimate the maps with; a live scan has none.
+    starts: None lets the scan choose the starts of the SPAD. silence_s: longest silence of the SPAD, in seconds.
     """
 
     command = "scan"
@@ -238,7 +239,7 @@ class LiveFacts:
         self._rig, self._plan, self.maps = rig, plan, maps or 1
 
     def count_starts(self) -> int:
-        """Largest number of starts of the SPAD."""
+        """Number of starts of the SPAD that the scan takes at most."""
         most = most_sweeps(self._rig, self._plan) or self.maps
         return -(-self.maps // most) + (_first_alone(self._rig) and self.maps > 1)
 
@@ -247,8 +248,10 @@ class LiveFacts:
         return TimeOfDay(timing, "virtual" if isinstance(self._rig.clock, VirtualClock) else "host")
 
     def truth(self, sweep: SweepAccount, column: NDArray[np.float64]) -> SweepTruth | None:
-        """Truth for a sweep bound to `column`; None without a simulated world. The world is asked only after the
-        estimate, which must never see the truth.
+        """Truth for a sweep; None without a simulated world. The world is asked only after the estimate, which must
+        never see the truth.
+
+        column: mean fractional column of each column's frames (`AcquiredMap.column`).
         """
         if self._rig.world is None:
             return None

@@ -26,7 +26,7 @@ class Source:
     published or dropped; if it raises, the source ends.
     times: notes when frames arrive.
 
-    Its errors and the SPAD's are passed to the readers, after the blocks that came before.
+    Errors of this thread and of the SPAD are passed to the readers, after the blocks that came before.
     """
 
     def __init__(
@@ -107,9 +107,10 @@ def blocks(
 ) -> Iterator[FrameBlock]:
     """Yield the blocks of one start of the SPAD, then raise the source's error, if there is one.
 
-    Raises DeviceTimeout if no block comes: the SPAD's error if the SPAD says that it has no frames, else the ring's
-    after HANG_S. silence_s: wait for a block after which `source.silences` is read. meanwhile: called before each wait;
-    as long as it returns True, waits last LOOK_S at most.
+    Raises DeviceTimeout if no block comes: the SPAD's own error if it reported silence twice, else the ring's after
+    HANG_S.
+    silence_s: seconds to wait for a block before `source.silences` is looked at.
+    meanwhile: called before each wait; while it returns True, a wait lasts LOOK_S at most.
     """
     while True:
         heard = len(source.silences)

@@ -46,8 +46,8 @@ class Hello(NamedTuple):
 
 
 def read_hello(line: bytes) -> Hello:
-    """The wishes of a client, a JSON object in one line; an empty line asks for the usual. Raises ValueError, with a
-    message for the client."""
+    """The wishes of a client, from its first line: a JSON object, or an empty line for the arrays in `USUAL`. Raises
+    ValueError, with a message for the client."""
     if len(line) > MOST_HELLO or not line.endswith(b"\n"):
         raise ValueError(f"the first line must end within {MOST_HELLO} bytes")
     try:
@@ -68,8 +68,9 @@ def read_hello(line: bytes) -> Hello:
 def message(
     kind: MessageKind, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]] | None = None
 ) -> list[memoryview]:
-    """The pieces of a message. `arrays` in its JSON says of each array its name, dtype (as numpy writes it), shape and
-    offset. The arrays are not copied, unless they are of another byte order or not in one piece."""
+    """The pieces of a message. Its JSON has the key `arrays`, with name, dtype (as numpy writes it), shape and offset
+    of each array. An array is copied only if it has another byte order or is not contiguous. Raises ValueError if
+    `about` has a number that is not finite."""
     places, pieces, at = [], [], 0
     for name, array in (arrays or {}).items():
         plain = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))

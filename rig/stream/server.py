@@ -1,4 +1,5 @@
-"""Serves depth maps to other programs: one thread follows the newest running scan, one more serves each client.
+"""Serves depth maps to other programs: one thread follows the newest running scan, one accepts connections, and each
+client has a thread.
 
 A client gets the newest map as soon as its connection has taken the one before; maps in between are counted, not kept.
 So a client that is slow, stops reading or floods costs one map of memory and a thread, and neither the scan nor any
@@ -54,7 +55,8 @@ class _Newest:
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of a server: clients that were served, clients that were refused or dropped, and maps sent."""
+    """Counts of a server. clients: those that were served. refused: those that were refused, for a wrong first line or
+    token, or because too many were connected. maps_sent: over all clients."""
 
     clients: int = 0
     refused: int = 0
@@ -62,9 +64,11 @@ class StreamCounts:
 
 
 class DepthServer:
-    """The server. `address` is (host, port) on which it listens. Use it as a context manager, which ends all threads.
+    """The server. `address` is (host, port) on which it listens. Use it as a context manager, which starts and ends all
+    threads.
 
-    Raises UsageError if the address is none of this computer's, the port is taken, or a token is too short.
+    Raises UsageError if the address is not one of this computer, the port is taken, or the token is too short or has
+    other characters than letters, digits, - and _.
     """
 
     def __init__(self, request: StreamRequest) -> None:

@@ -23,7 +23,8 @@ ACTIONS: Final = "rig.api.studies.cases"
 
 
 def cases_of(study: Study) -> list[Case]:
-    """The cases of a study whose action is done case by case. Raises UsageError with the problems of all settings."""
+    """The cases of a study whose action is done case by case (not `tradeoff` or `strategies`). Raises UsageError with
+    the problems of all settings."""
     cases: list[Case] = []
     problems: list[str] = []
     alone: dict[str, bool] = {}
@@ -111,7 +112,8 @@ def _holds_frames_alone(recording: Path) -> bool:
 
 
 def require_simulated(config: RigConfig) -> None:
-    """Raise UsageError unless a rig is simulated, as fast as it can be: a case must not depend on the time of day."""
+    """Raise UsageError unless a rig is simulated and runs on virtual time: a case must not depend on the time of
+    day."""
     if config.world is None:
         raise UsageError(f"{config.name} is a real rig, and cases are done on any computer; name a simulated one")
     if config.world.real_time:
@@ -119,5 +121,5 @@ def require_simulated(config: RigConfig) -> None:
 
 
 def kept_cases(cases: Sequence[Case], omit: Sequence[Mapping[str, Any]]) -> list[bool]:
-    """For each case, whether its labels keep it in the study."""
+    """For each case, False if its labels have all settings of a group in `omit`, else True."""
     return [not left_out(case.labels, omit) for case in cases]

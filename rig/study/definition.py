@@ -56,10 +56,15 @@ MOST_CASES: Final = 1_000_000
 class Study(BaseModel):
     """A study, as in its YAML file.
 
-    do: what is done in each case. vary: lists by setting; every combination is a case. also: further cases, each with
-    its own settings. set: settings that hold for all cases. omit: a combination that has all settings of one of these
-    is left out. repeat, seed: each is done with seeds seed, seed + 1, ... keep: whether each case keeps its files, such
-    as depth maps. time_limit, memory_limit: of a case. retries: how often a case is done again if its process died.
+    do: what is done in each case.
+    vary: lists by setting; every combination is a case.
+    also: further cases, each with its own settings.
+    set: settings that hold for all cases.
+    omit: groups of settings; a combination that has all settings of one group is left out.
+    repeat, seed: each case is done `repeat` times, with the seeds seed, seed + 1, ...
+    keep: whether each case keeps its files, such as depth maps.
+    time_limit, memory_limit: of a case, as text such as '10 min' and '500 MB'.
+    retries: how often a case is done again if its process died, hung or took too much memory.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -115,7 +120,8 @@ class Study(BaseModel):
                 yield setting
 
     def problems(self) -> list[str]:
-        """A line for each setting that the action does not have."""
+        """A line for each problem that a single field does not show, such as a setting that the action does not
+        have."""
         given = [*self.vary, *self.set, *(key for one in [*self.also, *self.omit] for key in one)]
         known = KEYS[self.do]
         dotted = self.do in ("scan", "calibrate")
@@ -167,7 +173,7 @@ class Study(BaseModel):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of what tells the cases from each other."""
+        """Names of the settings that tell the cases from each other, with 'seed' at the end."""
         keys = [*self.vary, *(key for one in self.also for key in one)]
         return (*dict.fromkeys(keys), "seed")
 
@@ -179,14 +185,15 @@ def _amount(text: str, units: Mapping[str, float]) -> float:
 
 
 def left_out(setting: Mapping[str, Any], omit: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a setting has all values of one that is to be left out."""
+    """Whether a setting has all values of one of the groups to be left out."""
     return any(all(key in setting and setting[key] == value for key, value in one.items()) for one in omit)
 
 
 def load_study(study: Study | PathLike | Mapping[str, Any]) -> Study:
     """A study, from its file or its content. Raises UsageError with one line per problem.
 
-    Paths in a file are relative to its folder. A config or scene may be a name instead.
+    Paths in a file are relative to its folder, those in a mapping to the current folder. A config or scene may be a
+    name instead. A Study is returned as it is.
     """
     if isinstance(study, Study):
         return study

@@ -1,8 +1,8 @@
 """One table, figure and page of any study, made from the folder of its batch.
 
-A line for each case, or for each of the rows that a case returns; a column for each setting that varies, each figure
-of the result and the case's name, which the folder of its kept files has too. The figure shows the numbers over the
-setting with the most values that are numbers.
+The table has a line for each case, or for each of the rows that a case returns. It has a column for each setting that
+varies, for each figure of the result, and for the case's name, which is also the name of the folder with its kept
+files. The figure shows the numbers over the setting with the most values that are numbers.
 """
 
 import statistics
@@ -70,7 +70,7 @@ def _flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, A
 
 
 def study_report(folder: Path) -> str:
-    """The page on a study's folder. Raises UsageError if there is none, or no case is done."""
+    """The HTML page on a study's folder. Raises UsageError if there is no study, or no case has ended yet."""
     rows = list(read_rows(folder))
     failures = read_failures(*failure_files(folder))
     if not rows and not failures:

@@ -1,11 +1,11 @@
-"""Decides who may see the page: its address, and checks of Host, Origin and token, the same for the page, its files and
-its web sockets.
+"""Decides who may see the page: the address on which it listens, and the checks of Host, Origin and token. The page,
+its files and its web sockets have the same checks.
 
 A browser sends requests to the page on behalf of any page that it shows. Three things keep strangers out. `Host` must
-name this computer: a foreign page whose name its owner has pointed to this computer (DNS rebinding) still sends its own
-name. `Origin`, which browsers send with every web socket, must be the page's own. And where the page can be reached
-from other computers, a token is needed: first in the address, then in a cookie that scripts cannot read and that is not
-sent on behalf of other pages.
+name this computer: if the owner of a foreign page points its name to this computer (DNS rebinding), the browser still
+sends that foreign name. `Origin`, which browsers send with every web socket, must be the page's own. And where the page
+can be reached from other computers, a token is needed: first in the address, then in a cookie that scripts cannot read
+and that is not sent on behalf of other pages.
 """
 
 import hmac
@@ -51,9 +51,10 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """The rules of one page. address, port: where it listens. token: what those who ask must know; None for nobody.
+    """The rules of one page. address, port: where it listens. token: what must be sent with each request; None if no
+    token is needed.
 
-    names: host names under which the page may be asked for, beside numbers.
+    names: host names under which the page may be asked for, besides IP addresses.
     """
 
     address: str
@@ -64,8 +65,9 @@ class Access:
     @classmethod
     def to(cls, host: str, port: int, token: str | None) -> "Access":
         """The rules for a page at `host`, a name or an IP address. On an address other than loopback there is always a
-        token, made here if none is given. Raises UsageError for a token that could be guessed or has characters that do
-        not belong into an address, or for a host that is none of this computer."""
+        token, made here if none is given. Raises UsageError for a token that could be guessed or has other characters
+        than letters, digits, - and _, for a port out of range, and for a host without an address. Only `listen` finds
+        out whether the address is one of this computer."""
         if token is not None and (_TOKEN.fullmatch(token) is None or len(token) < FEWEST_TOKEN_CHARACTERS):
             raise UsageError(
                 f"`token` has {len(token)} characters; it needs at least {FEWEST_TOKEN_CHARACTERS}, of letters, "
@@ -93,7 +95,8 @@ class Access:
         return f"spadrig-{self.port}"
 
     def url(self, name: str | None = None) -> str:
-        """The page's address with its token. name: of the computer, if not the address that it listens on."""
+        """The page's address with its token. name: host name to use; None for the IP address on which the page
+        listens."""
         host = name or self.address
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
@@ -114,11 +117,11 @@ class Access:
         )
 
     def knows(self, token: str) -> bool:
-        """Whether somebody who sends this token may ask; always where none is needed."""
+        """Whether this token is the right one. Always True if no token is needed."""
         return self.token is None or hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
     def brings_token(self, asked: Asked) -> bool:
-        """Whether a request that is no web socket has the right token in its address."""
+        """Whether a request that is no web socket has the right token in its address. False if no token is needed."""
         if self.token is None or asked.socket:
             return False
         query = parse_qsl(asked.path.partition("?")[2])
@@ -154,9 +157,10 @@ def is_loopback(address: str) -> bool:
 
 
 def listen(access: Access) -> tuple[socket.socket, Access]:
-    """A socket that listens, and the rules with the port that it has got. On `::` it takes connections of IPv4 too.
+    """A listening socket, and the rules with the port that the socket has got. On `::` it takes connections of IPv4
+    too.
 
-    Raises UsageError if the port is busy or the address is none of this computer's.
+    Raises UsageError if the port is busy or the address is not one of this computer.
     """
     family = socket.AF_INET6 if ":" in access.address else socket.AF_INET
     both = access.address == "::" and socket.has_dualstack_ipv6()

@@ -1,7 +1,7 @@
-"""Estimates one map of a recording again, with another estimator, in a process of its own.
+"""Estimates one map of a recording again, with another estimator, in a separate process.
 
 The page goes on meanwhile. The map's frames are cut from the recording into a temporary folder, so this takes as long
-for the last map of an hour as for the first.
+for the last map of an hour as for the first. Only a recording without markers is played from its beginning.
 """
 
 import multiprocessing
@@ -21,8 +21,8 @@ _END_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class EstimationRequest:
-    """Map `number` of the recording `run`. by_cutting: whether its frames can be cut out; a recording without markers
-    is played from its beginning instead."""
+    """A wish to estimate map `number` of the recording `run` again. by_cutting: whether the map's frames can be cut
+    out; a recording without markers is played from its beginning instead."""
 
     run: Path
     number: int
@@ -33,8 +33,8 @@ class EstimationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """An estimate that is over. folder: of a run with the one map; None if it failed. number: of that map in it.
-    problem: why it failed. summary: of the run."""
+    """An estimate that is over. folder: that of a run with the map; None if it failed. number: the map's number in that
+    run. problem: why it failed; else empty. summary: that of the run."""
 
     request: EstimationRequest
     folder: Path | None
@@ -44,7 +44,8 @@ class Estimated:
 
 
 class Estimation:
-    """An estimate under way; a context manager that ends it and removes its files."""
+    """An estimate under way; its `close` ends it and removes its files. Raises UsageError if no process can be
+    started."""
 
     def __init__(self, request: EstimationRequest) -> None:
         self.request = request

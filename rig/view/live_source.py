@@ -43,8 +43,11 @@ class LiveNews:
 
 
 class LiveSource:
-    """Follows the newest running scan. state: of the run that was followed last. slot: that run; None before any. rays:
-    of its camera, None if it is not calibrated."""
+    """Follows the newest running scan.
+
+    slot: the run that was followed last; None before the first. state: that of this run. rays: (u, v) of its camera;
+    None if it is not calibrated.
+    """
 
     def __init__(self) -> None:
         self.state = LiveState.WAITING
@@ -57,9 +60,11 @@ class LiveSource:
         self._looked_s = -LOOK_S
 
     def poll(self, *, maps: bool = True) -> LiveNews:
-        """Look for news, and attach to a newer run if none is followed. maps: False leaves maps and frames for later.
+        """Look for news, and attach to the newest run if none is followed. maps: if False, maps and frames are left for
+        later, unless the run is over.
 
-        Call it at least twice a second, or the run believes that nobody watches.
+        Call it at least twice a second, or the run assumes that nobody watches. Raises UsageError if others can enter
+        the folder of the slots.
         """
         if self._reader is None:
             self._attach()

@@ -1,7 +1,8 @@
 """The open pages: what each is told over its web socket, and what it asks for.
 
 A page is told the newest value of each topic. A page that reads slowly misses older ones, so at most one message for
-each topic waits for it, however long it hangs. A page that sends too much, or what no page of ours sends, is cut off.
+each topic waits for it, however long it hangs. A page that sends too much, or something that our page never sends, is
+cut off.
 
 A message to a page is binary: the length of a JSON text in bytes (uint32, little-endian), the text, and the bytes of a
 picture, if any. The JSON has the key `topic`. A message from a page is JSON with the key `ask`, one of `WISHES`.
@@ -48,7 +49,7 @@ least confidence shown, an estimate with another estimator, the map as it was re
 
 @dataclass(frozen=True, slots=True)
 class PageWish:
-    """A wish of a page. page: its number. ask: a key of `WISHES`. values: those that belong to it."""
+    """A wish of a page. page: its number. ask: a key of `WISHES`. values: those that belong to that key."""
 
     page: int
     ask: str
@@ -56,7 +57,7 @@ class PageWish:
 
     @classmethod
     def parse(cls, page: int, text: str | bytes) -> "PageWish":
-        """Read a message. Raises ValueError if no page of ours sends such a one."""
+        """Read a message. Raises ValueError for one that our page never sends."""
         try:
             content = parse_json(text)
         except ValueError:
@@ -107,7 +108,8 @@ class _Page:
 
 
 class Pages:
-    """All open pages. `tell`, `forget`, `answer` and `wishes` are for any thread, the rest for the server's loop.
+    """All open pages. `open`, `tell`, `forget`, `answer` and `wishes` are for any thread, the rest for the server's
+    loop.
 
     wake: set whenever there is a wish, and when a page comes or goes.
     """
@@ -127,15 +129,15 @@ class Pages:
         return len(self._pages)
 
     def begin(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Name the loop in which the pages are served; what was told before waits for them."""
+        """Set the loop in which the pages are served. What was told before is kept for the pages that come."""
         self._loop = loop
 
     def tell(self, topic: str, content: Mapping[str, Any], picture: bytes = b"") -> None:
-        """Tell all pages the newest value of a topic, and those that come later."""
+        """Tell the newest value of a topic to all pages, and to those that are opened later."""
         self._soon(self._tell, topic, message_bytes(topic, content, picture))
 
     def forget(self) -> None:
-        """Tell later pages nothing of what was told so far."""
+        """Forget what was told so far, so that later pages are not told it."""
         self._soon(self._newest.clear)
 
     def answer(self, page: int, topic: str, content: Mapping[str, Any]) -> None:
@@ -150,7 +152,8 @@ class Pages:
         return taken, list(self._following.values())
 
     async def serve(self, connection: "ServerConnection") -> None:
-        """Serve one page until its connection is closed. A page that sends too much, or no wish of ours, is cut off."""
+        """Serve one page until its connection is closed. A page is cut off if it sends too much, or what our page never
+        sends."""
         self._last_number += 1
         page = _Page(self._last_number, dict(self._newest))
         page.news.set()
@@ -214,6 +217,6 @@ class Pages:
 
 
 def message_bytes(topic: str, content: Mapping[str, Any], picture: bytes = b"") -> bytes:
-    """A message to a page."""
+    """A message to a page, in the form that the module describes."""
     text = json_text({"topic": topic, **content}).encode()
     return len(text).to_bytes(4, "little") + text + picture

@@ -33,12 +33,14 @@ _ROWS_KEPT: Final = 64
 
 
 class RunSource:
-    """A run's folder. Raises UsageError if it holds neither maps nor a recording, DamagedRecordingError if the manifest
-    or every block of a recording is damaged.
+    """A run's folder.
 
-    numbers: of the maps that can be shown, or of the pictures of imported frames. notes: sentences on what the page
-    cannot show, and why. manifest, summary: as the run wrote them, empty without them. recorded: whether its frames can
-    be estimated again.
+    numbers: those of the maps that can be shown, or of the pictures of imported frames. notes: sentences on what the
+    page cannot show, and why. manifest, summary: as the run wrote them; empty if they are missing or damaged. recorded:
+    whether its frames can be estimated again.
+
+    Raises UsageError if the folder holds neither maps nor a recording. If there are no maps, also DamagedRecordingError
+    or another error for a recording that cannot be read; with maps, `notes` says so instead.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -81,7 +83,8 @@ class RunSource:
         return self.rows is not None
 
     def map(self, number: int) -> ShownMap:
-        """A map as the run wrote it, or what there is of it. Raises UsageError if its files cannot be read."""
+        """A map as the run wrote it, or else the counts of its frames. Raises UsageError if its files cannot be read,
+        and another RigError or a DeviceError if its frames cannot."""
         if self._sums is not None:
             return ShownMap(number, {}, counts=self._sums.picture(number).astype(np.float32))
         if number in self._maps.indices:
@@ -156,9 +159,11 @@ class _ImportedFrames:
 
 
 def read_map(folder: Path, number: int, rays: tuple[Float32, Float32] | None, about: Mapping[str, Any]) -> ShownMap:
-    """Read the files of a map. rays: of the calibration; None takes those of the points that the run wrote.
+    """Read the files of a map. rays: (u, v) by the calibration; None: taken from the points that the run wrote. about:
+    kept with the map; its `min_confidence` is used.
 
-    Raises UsageError if a file cannot be read."""
+    Raises UsageError if a file cannot be read.
+    """
     arrays = MapFiles(folder).arrays(number)
     depth_m = arrays.pop("depth_m", None)
     if depth_m is None:

@@ -1,9 +1,9 @@
 """The one port of the viewer: our page, viser's client and server, and the page's own web socket, all behind `Access`.
 
-viser opens a port by itself, without any check. Here it does not: while it starts, its one call of `serve` (in
-`viser.infra`, of the package websockets) is replaced by ours, which listens on a socket that we have bound, checks
-every request before viser sees it, and serves viser's part below `/cloud`. Whatever clients send to viser is thrown
-away: it only shows points, and needs no messages for that. So nobody opens its public tunnel or fills its memory.
+viser by itself opens a port without any check. Here it does not: while it starts, its one call of `serve` (in
+`viser.infra`, of the package websockets) is replaced by ours. Ours listens on a socket that we have bound, checks every
+request before viser sees it, and serves viser's part below `/cloud`. Whatever clients send to viser is thrown away: it
+only shows points, and needs no messages for that. So nobody opens its public tunnel or fills its memory.
 """
 
 import asyncio
@@ -64,10 +64,11 @@ class _Route:
 
 
 class ViewServer:
-    """Serves until `close`. access, listening: from `rig.view.access.listen`. download: makes the file of POINTS, on a
-    thread.
+    """Serves until `close`. access, listening: from `rig.view.access.listen`. download: makes the file of POINTS; it is
+    called on another thread.
 
-    viser: its server, for the scene. Raises RuntimeError if this version of viser opens its port in another way.
+    viser: the server of the package viser, for the scene. Raises RuntimeError if this version of viser opens its port
+    in another way.
     """
 
     def __init__(self, access: Access, listening: socket.socket, pages: Pages, download: Download) -> None:

@@ -34,9 +34,10 @@ Limits = tuple[float, float]
 class ShownMap:
     """A map. Arrays of pixels are (rows, width); each may be None if the run does not have it.
 
-    number: of the map in its run. depth_m, confidence, depth_sd_m: float32, as in `rig.depth.depth.DepthMap`. counts:
-    summed over the sweep, float32, NaN where unknown. picture_of_counts: the PNG file of them, if there is one. rays:
-    (u, v), NaN where unknown. stripe: arrays (rows, columns) of the stripe table. about: more about the map.
+    number: that of the map in its run. depth_m, confidence, depth_sd_m: float32, as in `rig.depth.depth.DepthMap`.
+    counts: summed over the sweep, float32, NaN where unknown. picture_of_counts: a PNG file of the counts, if there is
+    one. rays: (u, v), NaN where unknown. stripe: arrays (rows, columns) of the stripe table by name. about: more about
+    the map, such as `min_confidence`, `doubts` and `fog`.
     """
 
     number: int
@@ -50,15 +51,16 @@ class ShownMap:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def kept(self, least_confidence: float) -> Bools | None:
-        """Pixels with a depth of at least this confidence; None without depth."""
+        """Pixels with a depth of at least this confidence, bool (rows, width); all with a depth if confidence is not
+        known. None without depth."""
         if self.depth_m is None:
             return None
         known = np.isfinite(self.depth_m)
         return known if self.confidence is None else known & (self.confidence >= np.float32(least_confidence))
 
     def column_at(self, row: int, x: int) -> int | None:
-        """The column whose stripe is nearest to a pixel; None if the row has no stripe. Stripes that can have made the
-        depth are preferred if one is within NEAR_PX."""
+        """The column whose stripe is nearest to a pixel; None if the row has no stripe. Stripes whose confidence is
+        high enough to have made the depth are preferred, if one is within NEAR_PX."""
         x_px = self.stripe.get("x_px")
         if x_px is None or not 0 <= row < len(x_px):
             return None
@@ -83,7 +85,7 @@ class ShownMap:
         return found
 
     def stripe_at(self, row: int, column: int) -> dict[str, float | None]:
-        """The stripe table's values of one column on one row."""
+        """The stripe table's values of one column on one row; None for each that is not finite."""
         values = {name: float(array[row, column]) for name, array in self.stripe.items()}
         return {name: value if np.isfinite(value) else None for name, value in values.items()}
 
@@ -126,8 +128,8 @@ class Legend(NamedTuple):
 
 
 class ColouredPoints(NamedTuple):
-    """Points of a map. xyz_m: float32 (n, 3). rgb: uint8 (n, 3). of: their number before they were thinned. legend:
-    None if the map has no values for colours; points are grey then."""
+    """Points of a map. xyz_m: float32 (n, 3), in the camera's frame. rgb: uint8 (n, 3). of: their number before they
+    were thinned. legend: None if the map has no values for colours; points are grey then."""
 
     xyz_m: Float32
     rgb: NDArray[np.uint8]
@@ -140,7 +142,7 @@ def points(
 ) -> ColouredPoints | None:
     """At most `most` points of a map, spread evenly over its pixels, in colours. None if there are none.
 
-    by: one of COLOURS. limits: of the colours of depth.
+    by: one of COLOURS. limits: depths in m at the ends of the colours, if points are coloured by depth.
     """
     kept = shown.kept(least_confidence)
     if kept is None or shown.depth_m is None or shown.rays is None:
@@ -173,14 +175,15 @@ def _scaled(shown: ShownMap, by: str, limits: Limits | None) -> tuple[NDArray[np
 
 
 class Drawn(NamedTuple):
-    """A picture. png: the file, each pixel one of the map's. legend: None for grey pictures."""
+    """A picture. png: the file; each of its pixels is one of the map. legend: None for grey pictures."""
 
     png: bytes
     legend: Legend | None
 
 
 def picture_of(shown: ShownMap, what: str, least_confidence: float, limits: Limits | None) -> Drawn | None:
-    """A picture of 'depth', 'counts' or 'confidence'; None if the map has no such values."""
+    """A picture of 'depth', 'counts' or 'confidence'; None if the map has no such values. Depth and confidence are
+    shown where confidence is at least `least_confidence`. limits: as in `points`."""
     if what == "counts":
         png = shown.picture_of_counts
         if png is None and shown.counts is not None:
@@ -194,7 +197,8 @@ def picture_of(shown: ShownMap, what: str, least_confidence: float, limits: Limi
 
 
 def ply_of(shown: ShownMap, least_confidence: float) -> bytes | None:
-    """All points of a map of at least this confidence as a PLY file; None without depth or rays."""
+    """All points of a map of at least this confidence as a PLY file, with 0 for unknown counts; None without depth or
+    rays."""
     kept = shown.kept(least_confidence)
     if kept is None or shown.depth_m is None or shown.rays is None:
         return None

@@ -60,10 +60,11 @@ def view(
     """Serve a page that shows a run (`rig view`), until an interrupt (Ctrl-C).
 
     run: folder of a run, with or without recording; None shows the running scan, and waits for one.
-    request, changes: options, as a `ViewRequest` or by the names of its fields.
+    request, changes: options, as a `ViewRequest` or by the names of its fields. With `until_closed`, the page of a scan
+    also ends once the scan is over and no browser shows it.
     ready: called with the page's address, token included, once it can be opened.
-    Raises UsageError if there is nothing to show, viser is not installed, the page cannot be served at the address
-    that was asked for, or an option is out of range.
+    Raises UsageError if there is nothing to show, viser is not installed, the page cannot be served at the address that
+    was asked for, or an option is out of range; DamagedRecordingError for a recording without maps that is damaged.
     """
     request = replace(request or ViewRequest(), **changes)
     _require_sizes(request)

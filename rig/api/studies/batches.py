@@ -46,8 +46,8 @@ class BatchResult:
     folder: Path
 
     def uninterrupted(self) -> Self:
-        """The result itself, for callers that need the whole study. Raises KeyboardInterrupt if an interrupt ended it,
-        so that it ends a loop over studies too."""
+        """The result itself, for callers that need the whole study. Raises KeyboardInterrupt if an interrupt ended the
+        study; a loop over studies then ends too."""
         if self.batch.verdict == "aborted":
             raise KeyboardInterrupt
         return self
@@ -65,9 +65,12 @@ class BatchResult:
 class BatchPlan:
     """The work that a study would be.
 
-    cases, left: number of all cases, those of the shard if the request names one, and of those without a result.
-    workers: cases at once, on this computer. case_s: mean wall time of a case in seconds, with one thread, found by
-    trying a few. tried_s: time of each that was tried. wall_s: of all that are left.
+    cases: number of all cases, or of those in the shard if the request names one.
+    left: number of these that have no result in `out`.
+    workers: cases at once, on this computer.
+    case_s: mean wall time of a case in seconds, with one thread, found by trying a few.
+    tried_s: wall time of each that was tried, in seconds.
+    wall_s: estimated time of all that are left, in seconds.
     """
 
     cases: int
@@ -90,11 +93,12 @@ def batch(
 
     study: its file, or its content as a mapping or a `Study`.
     request, changes: options, as a `BatchRequest` or by the names of its fields; `out` is needed.
-    client: of a dask cluster of your own, which stays open; takes the place of `cluster`.
+    client: that of your own dask cluster, used in place of `cluster`; it stays open.
     progress: called with the number of finished cases and of all.
 
-    Raises UsageError for a study that cannot be done, or if `out` holds another one. An interrupt ends it with the
-    verdict 'aborted'; everything that is done by then is in the table.
+    Raises UsageError for a study that cannot be done, or if `out` holds another study, and RigError if a cluster is
+    lost. An interrupt ends the batch with the verdict 'aborted'. All results so far are kept; they are in the table,
+    unless the request names a shard.
     """
     request = replace(request or BatchRequest(), **changes)
     loaded, shard = _checked(study, request)
@@ -237,8 +241,8 @@ _FIELDS = {
 
 
 def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Client | None") -> Executor:
-    """The executor that a request asks for, for the cases of a store. Raises UsageError, and leaves the store's folder
-    as it was before."""
+    """The executor that a request asks for, for the cases of a store. If it raises UsageError, the store's folder is
+    left as it was before the store was made."""
     try:
         if client is None and request.cluster in (None, OWN_PROCESSES):
             return Pool(request.workers, limits)

@@ -13,7 +13,7 @@ from rig.scan.run import RunResult
 
 
 def scan_once(config: Mapping[str, Any], maps: int, seed: int, keep: str | None = None) -> dict[str, Any]:
-    """Scan with a simulated rig. keep: folder for the run."""
+    """Scan with a simulated rig; returns figures of the run. keep: folder for the run; None keeps nothing."""
     return _figures(scan(RigConfig.model_validate(config), maps=maps, seed=seed, out=keep).uninterrupted())
 
 
@@ -26,13 +26,15 @@ def reconstruct_once(
     min_confidence: float | None = None,
     keep: str | None = None,
 ) -> dict[str, Any]:
-    """Make the maps of a recording, or of frames alone with `plan` and `calibration`. keep: folder for the run."""
+    """Make the maps of a recording, or of frames alone with `plan` and `calibration`; returns figures of the run. keep:
+    folder for the run; None keeps nothing."""
     request = ReconstructRequest(estimator=estimator, filter=filter, min_confidence=min_confidence, out=keep)
     return _figures(reconstruct(recording, plan, calibration, request).uninterrupted())
 
 
 def calibrate_once(config: Mapping[str, Any], poses: int, seed: int, keep: str | None = None) -> dict[str, Any]:
-    """Calibrate a simulated rig with a board. keep: folder for the session."""
+    """Calibrate a simulated rig with a board; returns verdict and summary. keep: folder for the session; None keeps
+    nothing."""
     result = calibrate_planes(RigConfig.model_validate(config), poses=poses, seed=seed, out=keep)
     return {"verdict": "passed" if result.verdict.passed else "failed", "summary": _without_places(result.summary)}
 

@@ -1,4 +1,4 @@
-"""Reconstruction of one recording by parts that are done at the same time, on this computer or on many."""
+"""Reconstruction of one recording in parts that are done at the same time, on this computer or on many."""
 
 import shutil
 import tempfile
@@ -54,14 +54,16 @@ def reconstruct_parts(
     client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Make the depth maps of a recording by parts (`rig reconstruct --cluster`). The maps are those of `reconstruct`,
+    """Make the depth maps of a recording in parts (`rig reconstruct --cluster`). The maps are those of `reconstruct`,
     bit for bit, and are in the request's `out`; the result holds none of them.
 
-    An estimator that learns needs the states that the recording's own scan has kept for each map. So it must be the
-    estimator of the scan, with the same calibration. An interrupted reconstruction goes on where it stopped: what is
-    done is beside `out`, in a folder with `.parts` added to its name.
+    An estimator that learns from map to map needs the states that the recording's scan has kept for each map. So the
+    request must then name the estimator of that scan, or none, and the calibration must be the same. An interrupted
+    reconstruction goes on where it stopped: finished parts are beside `out`, in a folder with `.parts` added to its
+    name.
 
-    Raises UsageError for a recording that cannot be done by parts, and RigError if a part fails.
+    Raises UsageError for a recording that cannot be done in parts, RigError if a part fails, and KeyboardInterrupt
+    after an interrupt.
     """
     request, folder = request or ReconstructRequest(), Path(recording)
     if request.out is None:
@@ -113,7 +115,8 @@ def reconstruct_parts(
 def reconstruct_part(
     recording: str, first: int, end: int, calibration: str | None, options: dict[str, Any], keep: str
 ) -> dict[str, Any]:
-    """The maps `first` to before `end` of a recording, written as a run into the folder `keep`."""
+    """Make the maps `first` to `end` - 1 of a recording and write them as a run into the folder `keep`; returns figures
+    of the run."""
     with tempfile.TemporaryDirectory(prefix="spadrig-part-") as scratch:
         part = Path(scratch) / "part"
         cut(recording, part, maps=f"{first}:{end}")
