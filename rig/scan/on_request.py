@@ -54,7 +54,7 @@ class RecordingSwitch:
     def __init__(self, before: str | float = 0.0) -> None:
         try:
             self.before_s = parse_quantity(before, "time") if isinstance(before, str) else float(before)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise UsageError(f"`before` is {before!r}: {error}") from None
         if not 0 <= self.before_s < float("inf"):
             raise UsageError(f"`before` is {before!r}; it must be 0 s or more")

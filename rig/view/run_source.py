@@ -198,7 +198,10 @@ def _summary(folder: Path) -> Mapping[str, Any]:
 
 def _bytes(folder: Path, kind: str, number: int, suffix: str) -> bytes | None:
     file = folder / kind / f"{number:06d}{suffix}"
-    return file.read_bytes() if file.exists() else None
+    try:
+        return file.read_bytes() if file.exists() else None
+    except OSError as error:
+        raise UsageError(f"cannot read {file}: {error.strerror}; choose another map") from error
 
 
 def _worth(folder: Path, number: int, shape: tuple[int, ...]) -> dict[str, Float32]:

@@ -422,8 +422,11 @@ class _ShowsRun(_Shows):
         self.tell_map()
 
     def _begin(self, estimator: str) -> None:
-        if self._again is not None or self._shown is None or self._source.rows is None:
+        if self._again is not None:
             self.say("An estimate is under way; wait for it.")
+            return
+        if self._shown is None or self._source.rows is None:
+            self.say("No recorded map is shown that could be estimated again.")
             return
         least = self._least or self._source.min_confidence
         cut = self._source.rows.plan.blanking is None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from rig.errors import UsageError
 from rig.live import record_wish
 from rig.live.record_wish import STATE, WISH, followed, record
 from rig.scan.on_request import RecordingSwitch
@@ -36,3 +37,9 @@ def test_the_files_go_however_the_scan_ends(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), followed(tmp_path, switch):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("before", [None, [1.0], "soon", -1.0, float("inf"), float("nan")])
+def test_what_is_no_time_is_refused(before: object) -> None:
+    with pytest.raises(UsageError, match="`before` is "):
+        RecordingSwitch(before)  # type: ignore[arg-type]

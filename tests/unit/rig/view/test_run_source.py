@@ -168,6 +168,14 @@ def test_a_map_whose_file_is_cut_short_is_named(run: Path) -> None:
     assert source.map(0).depth_m is not None
 
 
+def test_a_picture_that_cannot_be_read_is_named(run: Path) -> None:
+    file = run / "intensity" / "000001.png"
+    file.unlink()
+    file.mkdir()
+    with pytest.raises(UsageError, match=r"cannot read .*000001\.png"):
+        RunSource(run).map(1)
+
+
 @pytest.mark.parametrize("name", ["nowhere", "empty", "file"])
 def test_what_is_no_run_is_refused_with_the_next_step(name: str, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
