@@ -187,7 +187,10 @@ def alike_speeds(speeds_per_s: ArrayLike) -> NDArray[np.int64]:
 
 
 def speed_range(speeds_per_s: ArrayLike) -> tuple[float, float]:
-    """The range of speeds for which a lag measured at these speeds holds."""
+    """(lowest, highest) speed for which a lag measured at these speeds is assumed to hold, SPEED_MARGIN beyond them.
+
+    speeds_per_s: at least one, in command units per second, all above 0 whatever the direction.
+    """
     speeds = np.asarray(speeds_per_s, np.float64)
     return float(speeds.min() * (1 - SPEED_MARGIN)), float(speeds.max() * (1 + SPEED_MARGIN))
 

@@ -179,9 +179,11 @@ class RigState:
         return corners, passages
 
     def stepped(self, terms: Terms, shared: Array, poses: Sequence[Array], sightings: Sequence[Sighting]) -> "RigState":
-        """The state after changes of shared parameters (p,) and of poses (6,). Raises CalibrationError if there is no
-        such model.
-        """
+        """The state after changes of the shared parameters (p,), in the order of `terms.names`, and of the views'
+        poses.
+
+        poses: for each view (6,), a rotation vector in rad about the camera's axes, then a shift in m. Raises
+        CalibrationError if there is no such model."""
         untimed = len(terms.names) - len(TIMES)
         moved = [name for name, change in zip(terms.names[:untimed], shared, strict=False) if change != 0]
         model = with_parameters(self.model, moved, [shared[terms.names.index(name)] for name in moved])

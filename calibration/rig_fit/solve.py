@@ -97,7 +97,10 @@ def normals(rows: Sequence[tuple[Rows, Rows]], weight: Sequence[Weights], jitter
 
 
 def view_normal(corners: Rows, passages: Rows, weight: Weights, jitter: float) -> ViewNormal:
-    """The normal equations of one view after elimination of its pose."""
+    """The normal equations of one view after elimination of its pose.
+
+    jitter: variance of the mirror's jitter, in squared command units. Raises LinAlgError if the equations do not
+    determine the pose."""
     of_corners, corner_right, corner_chi2 = _products(corners, weight.corners)
     of_passages, passage_right, passage_chi2 = _products(passages, weight.passages)
     if jitter and weight.starts.size:

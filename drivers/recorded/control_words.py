@@ -1,10 +1,10 @@
 """The commands in recorded control traffic that make a device do something, without the queries between them.
 
 Queries and the numbers with which the drivers of PrawnDO and Teensy mark their lines are left out, because how many
-there are depends on the host's timing. The drivers may send a command again when a reply was lost, so repeats on a
-serial line count once. This module knows the queries of all devices on serial lines, of Helios and of LaserCube
-(docs/reference/hardware.md). Traffic of devices on the network is left out.
-"""
+there are depends on the host's timing. The drivers may send a command again when a reply was lost, so immediate repeats
+of a command, or of a pair of commands, on a serial line count once. This module knows the queries of all devices on
+serial lines, of Helios and of LaserCube (docs/reference/hardware.md); those of other USB devices are not left out.
+Traffic of devices on the network is left out."""
 
 import re
 from collections import defaultdict

@@ -6,9 +6,9 @@ the SPAD, GPIO1 is the laser's gate, GPIO2 marks records.
 
 The firmware has neither loops nor a watchdog. So programs are written out in full. They end with words that hold
 everything low, whatever happens to the host. The firmware cannot read its pins while a program runs, nor report whether
-it waits or plays. The trigger is a level, so a wait ends at once if the trigger is high; short waits within a held
-pulse check the scan marker in this way. Pulses that the board would play differently from what was written are refused.
-"""
+it waits or plays. The trigger input gets the scan marker. It is a level, so a wait ends at once while the marker is
+high. In this way short waits within a held pulse (`drivers.interfaces.Pulse`) check the marker. Pulses that the board
+would play differently from what was written are refused."""
 
 import logging
 from collections.abc import Sequence

@@ -93,7 +93,8 @@ class Extent:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCase:
-    """A row that is to be measured. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
+    """A row of the table of `rig bench`, still to be measured. window: in px. exposures: per column; None for stages
+    without columns. frame_bytes: bytes read from memory per frame; None if that has no meaning."""
 
     stage: str
     window: int

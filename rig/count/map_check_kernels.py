@@ -70,10 +70,10 @@ def compare_lines(
     the nearest partner column. Writes to out (points, 3 + orders).
 
     lines: (3, points, window) counts of each point's line and its first two partners; exposures, row, column: (3 or
-    more, points). shift: (2 or more, points), pixels from the stripe at the point to that at the partner. x0:
-    (columns,), first stored pixel; x_lo, x_hi: (rows, columns), first and last pixel of each search window. usual:
-    (rows, width), mean ones per exposure of each pixel over the sweep, NaN for unusable pixels; least: replaces lower r
-    in sqrt(K r).
+    more, points), with at least 1 exposure in each of these three lines. shift: (2 or more, points), pixels from the
+    stripe at the point to that at the partner. x0: (columns,), first stored pixel; x_lo, x_hi: (rows, columns), first
+    and last pixel of each search window. usual: (rows, width), mean ones per exposure of each pixel over the sweep, NaN
+    for unusable pixels; least: replaces lower r in sqrt(K r).
     orders: (orders, WORD_PX), pixels of each word.
 
     The first two outputs are the light in common with each partner, which is 0 on average for noise, haze and anything

@@ -69,7 +69,8 @@ def bytes_of(file: Path) -> NDArray[np.uint8]:
 
 
 def chunks_of(frames: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
-    """Yield `frames` (n, ...) in pieces of whole frames, at most `CHUNK_BYTES` if one fits."""
+    """Yield `frames` (n, ...) in pieces of whole frames, each of at most `CHUNK_BYTES`, or one frame if it is
+    larger."""
     step = max(1, CHUNK_BYTES // max(1, frames[:1].nbytes))
     for first in range(0, len(frames), step):
         yield frames[first : first + step]

@@ -65,7 +65,8 @@ class Axis:
         return cls(0.0 if 0 <= low < room * 8 else low - room, high + room, False, start_px, end_px)
 
     def px(self, value: float) -> float:
-        """Pixel of a value; NaN if it cannot be shown."""
+        """Pixel of a value; beyond the ends of the axis for a value outside it. NaN if the value is not finite, or not
+        above 0 on a logarithmic axis."""
         if not math.isfinite(value) or (self.log and value <= 0):
             return math.nan
         low, high, at = (math.log(v) if self.log else v for v in (self.low, self.high, value))

@@ -113,11 +113,10 @@ def readings(rng: np.random.Generator, electrons: Array, camera: ConventionalCam
 class SensorBits:
     """The sensor's changes to the bits, pixel by pixel.
 
-    Dead and hot pixels and bit errors are exact. Crosstalk and afterpulses have the right mean: each pixel has the
-    probability that follows from the brightness of its neighbours and of the frame before, but it is drawn
-    independently of them. The rows above and below may not be measured, so they are assumed to be as bright as the
-    pixel itself.
-    """
+    Dead and hot pixels and bit errors are exact. Crosstalk, afterpulses and dead time change the probability of each
+    pixel, which is then drawn independently of all others. For crosstalk, the neighbours on the left and right count
+    with their own brightness. The rows above and below, which may not be measured, and the frame before are assumed to
+    be as bright as the pixel itself. As far as that is so, the means are right."""
 
     def __init__(self, flux: FluxModel, rows: NDArray[np.int64], frame_s: float) -> None:
         """rows: image rows that are simulated. frame_s: exposure and period of a frame, in seconds."""

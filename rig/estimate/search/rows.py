@@ -102,16 +102,15 @@ class SearchTables(NamedTuple):
 
 
 class RowAnswers(NamedTuple):
-    """Answers of a sweep, to be filled.
+    """Answers of a sweep, to be filled. Lanes and lane order are those of `rig.count.lane_order`.
 
     stripe: float32 (columns, FIELDS, rows), NaN and confidence 0 if there is nothing. quiet: int32 (rows, PAIRS, lanes
-    of the sensor + LANES, 2), ones of pixels while clearly behind a stripe, in lane order; quiet_exposures: int32
-    (rows, the same number of lanes + 1), their exposures in 1/EXPOSURE_PARTS, stored as differences from lane to lane.
-    light: int32, like quiet, ones of every pixel within the windows. The most recent ones of both are still in
-    quiet_here and light_here, uint8 (rows, PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows
-    that are kept; line_start: int32 (columns + 1,), each column's first entry in line_row, int32, the rows kept, in
-    order.
-    """
+    of the sensor + LANES, 2), in lane order: how often each pixel read 1 while it was clearly behind a stripe.
+    quiet_exposures: int32 (rows, lanes of the sensor + LANES + 1), the exposures during which it was, in
+    1/EXPOSURE_PARTS, stored as differences from lane to lane. light: int32, like quiet: how often each pixel within the
+    windows read 1. The latest counts are not yet in quiet and light, but in quiet_here and light_here, uint8 (rows,
+    PAIRS, lanes of the window, 2). lines: int32 (lines, window), counts of rows that are kept; line_start: int32
+    (columns + 1,), each column's first entry in line_row, int32, the rows kept, in order."""
 
     stripe: Float32
     quiet: Int32

@@ -234,7 +234,8 @@ class AttachedDevice:
                 self._give_back(interface)
 
     def set_configuration(self, value: int) -> None:
-        """Choose a configuration. Raises EBUSY while an interface is claimed, ENOENT for an unknown one."""
+        """Choose a configuration: 1, or 0 for none. Raises EBUSY while an interface is claimed, ENOENT for any other
+        configuration."""
         with self._alive():
             if self._claims:
                 raise UsbFailure(errno.EBUSY)

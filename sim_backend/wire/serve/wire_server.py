@@ -38,7 +38,7 @@ class WireServer(ABC, Generic[Model]):
 
     @property
     def endpoint(self) -> Endpoint:
-        """The endpoint of that address, for `Surroundings.ports`."""
+        """The endpoint of `address`, for `Surroundings.ports`."""
         return Endpoint(self.address)
 
     def start(self) -> Self:

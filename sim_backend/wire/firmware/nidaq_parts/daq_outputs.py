@@ -102,7 +102,7 @@ class Output:
         self.play(Samples(Edges(time_s, 1e-9), 1, np.array([value])))
 
     def cut(self, time_s: float) -> None:
-        """Hold from a time on the value that the output has right before it."""
+        """Drop what was to come from this time on, and hold the value that the output has right before it."""
         with self._lock:
             while self._spans and self._spans[-1].edges.count(time_s) == 0:
                 self._spans.pop()
