@@ -39,6 +39,8 @@ WIDTH, HEIGHT = 64, 16
 COLUMNS, EXPOSURES = 20, 12
 POWER = "20 mW"
 CARD_BUFFER_S = 0.5
+PATIENT_BUFFER_S = 1.0
+"""Buffer of an NI card where nothing is measured: the mirror goes on until a busy machine has noticed a hung server."""
 STILL_S = 1e-3
 """A mirror whose drive did not change for so long rests; a galvo needs about as long to come to rest."""
 STEP_S = 5e-5
@@ -132,6 +134,7 @@ class ScanBench:
     folder: Path
     bus_environment: dict[str, str]
     applications: Applications
+    card_buffer_s: float
     number: int = 0
     started_s: float = 0.0
 
@@ -225,10 +228,12 @@ def scan_bench(
             elif laser == "obis":
                 world.laser.cdrh_delay_s = 0.2
             ports = {name: endpoint.address for name, endpoint in world.ports.items()}
+            buffer_s = CARD_BUFFER_S if laser_silence is None else PATIENT_BUFFER_S
             (folder / "rig.yaml").write_text(
-                yaml.safe_dump(_config(laser, ports, silence, scanner, sync, laser_silence))
+                yaml.safe_dump(_config(laser, ports, silence, scanner, sync, laser_silence, buffer_s))
             )
-            bench = ScanBench(world, folder, {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}, applications)
+            places = {"UMOCKDEV_DIR": bus.environment()["UMOCKDEV_DIR"]}
+            bench = ScanBench(world, folder, places, applications, buffer_s)
             try:
                 yield bench
             finally:
@@ -250,7 +255,7 @@ def _end(bench: ScanBench) -> None:
 
 
 def _config(
-    laser: str, ports: dict[str, str], silence: str, scanner: str, sync: str, laser_silence: str | None
+    laser: str, ports: dict[str, str], silence: str, scanner: str, sync: str, laser_silence: str | None, buffer_s: float
 ) -> dict[str, Any]:
     """The config of a rig with real ports; its world is outside of it."""
     content = emulated(**ports)
@@ -265,7 +270,7 @@ def _config(
         content["scanner"] |= {"kind": scanner, "buffer": "220 ms"}
     if scanner == "nidaq":
         del content["scanner"]["frame"]
-        card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{CARD_BUFFER_S} s"}
+        card = {"kind": scanner, "port": f"grpc={ports['scanner']}", "buffer": f"{buffer_s} s"}
         content["scanner"] |= card
     content["laser"]["kind"], content["sync"]["kind"] = laser, sync
     if sync == "pulsestreamer":

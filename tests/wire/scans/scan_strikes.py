@@ -139,7 +139,7 @@ def _reset_card(bench: ScanBench) -> None:
 def _delay_card(bench: ScanBench) -> None:
     """Its points run dry, and markers keep their last level."""
     with bench.world.scanner_plug.lock:
-        time.sleep(2 * CARD_BUFFER_S)
+        time.sleep(2 * bench.card_buffer_s)
 
 
 SCAN_STRIKES = {
