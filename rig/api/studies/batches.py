@@ -27,6 +27,8 @@ from rig.requests import BatchRequest, StrategiesRequest, TradeoffRequest
 from rig.run_folder.disk import replace_file
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.plain_json import json_line
+from rig.strategies.comparison.compare import notes_of
+from rig.strategies.strategy import find_strategy
 from rig.study.cases import cases_of, kept_cases
 from rig.study.definition import Study, load_study
 from rig.study.tables import lines_of, study_report
@@ -173,10 +175,12 @@ class _Made:
     cases: list[Case]
     write: Callable[[RunFolder, list[Result | None], bool], object] | None = None
     name: str = ""
+    about: tuple[str, ...] = ()
+    """Lines that must be shown with the results."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A sentence on settings that mean the same, if there are some: they are one case."""
+        """What must be shown, and a sentence on settings that mean the same, if there are some: they are one case."""
         first: dict[str, Case] = {}
         same = []
         for case in self.cases:
@@ -184,9 +188,10 @@ class _Made:
             if first.setdefault(meant, case) is not case:
                 same.append((case, first[meant]))
         if not same:
-            return ()
+            return self.about
         words = [setting_of(each.labels) for each in same[0]]
         return (
+            *self.about,
             f"{len(same)} of {len(self.cases)} combinations mean the same as another one, and are in the table once; "
             f"the first is '{words[0]}', which is '{words[1]}'",
         )
@@ -220,17 +225,19 @@ def _cases_and_table(study: Study) -> _Made:
     config = single.pop("config", SIMULATED)
     fields = {_FIELDS[key]: [*values] for key, values in lists.items()}
     options: dict[str, Any] = {**single, **fields, "seed": study.seed, "repeat": study.repeat}
+    about: tuple[str, ...] = ()
     if study.do == "tradeoff":
         cases, write = tradeoffs.as_cases(config, TradeoffRequest(**options))
     else:
         cases, write = strategies.as_cases(config, StrategiesRequest(**options))
+        about = notes_of(find_strategy(case.inputs["way"]) for case in cases)
     kept = kept_cases(cases, study.omit)
 
     def write_kept(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
         there = iter(found)
         return write(folder, [next(there) if keep else None for keep in kept], aborted)
 
-    return _Made(list(compress(cases, kept)), write_kept, study.do)
+    return _Made(list(compress(cases, kept)), write_kept, study.do, about)
 
 
 _FIELDS = {

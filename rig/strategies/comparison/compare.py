@@ -8,7 +8,7 @@ table is one strategy in one scene and air, with one rule and time.
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -199,8 +199,12 @@ def tabulate(
         if result is not None
         for row, compute_s in zip(result["rows"], result["measured"]["compute_s"], strict=True)
     )
-    notes = tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
-    return Comparison(rows, {way.name: way.sentence for way in ways}, notes, verdict)
+    return Comparison(rows, {way.name: way.sentence for way in ways}, notes_of(ways), verdict)
+
+
+def notes_of(ways: Iterable[Strategy]) -> tuple[str, ...]:
+    """Lines that must be shown with results of these strategies: that the patterns of some are protected."""
+    return tuple(dict.fromkeys(f"{way.name}: {way.sentence}" for way in ways if PROTECTED in way.sentence))
 
 
 def _measured(scene: OpenScene, way: Strategy, rule: Rule, time_s: float, seeds: range) -> StrategyRow:

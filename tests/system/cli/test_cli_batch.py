@@ -107,8 +107,21 @@ def test_a_study_of_strategies_has_the_rows_of_the_comparison(tmp_path: Path) ->
         for fog in ("clear", "20m")
         for way in asked["strategies"]
     ]
+    assert done.batch.notes == ()
     planned = api.plan_batch({**study, "omit": [{"fog": "20m", "time": "20ms"}]}, out=tmp_path / "none")
     assert planned.cases == 2
+
+
+@pytest.mark.usefixtures("here")
+def test_a_study_says_that_patterns_are_protected(tmp_path: Path) -> None:
+    """As `rig tradeoff --strategies` does. One millisecond is too short for these patterns, and quickly done."""
+    set_ = {"config": "small", "scene": "ramp", "fog": "clear", "rule": "energy", "rows": 4, "time": "1ms"}
+    done = api.batch(
+        {"do": "strategies", "set": set_, "vary": {"strategy": ["bch", "gray-spad"]}}, out=tmp_path / "out"
+    )
+    (note,) = done.batch.notes
+    assert note.startswith("bch: ")
+    assert "simulation for comparison only" in note
 
 
 @pytest.mark.usefixtures("here")
