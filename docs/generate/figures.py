@@ -8,6 +8,7 @@ them on a forge, and so that a change of the program that alters one is seen.
 """
 
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +21,10 @@ from rig.api import configure, plan_scan, scan, tradeoff
 from rig.plan.scan_plan import column_command
 from rig.report.charts import Panel, Series, chart_svg
 from rig.run_folder.pictures import depth_limits, depth_scale, intensity_picture
+from rig.strategies.apparatus import Rule
+from rig.strategies.comparison.compare import StrategyRow
+from rig.strategies.comparison.files import time_svg
+from rig.strategies.strategy import find_strategy
 from rig.tradeoff.files import COLOURS
 from rig.tradeoff.row_light import Array, scene_lights
 from sim_backend.scenes.medium import KOSCHMIEDER
@@ -151,6 +156,30 @@ def pictures() -> str:
     return diagrams.pictures(named)
 
 
+def other_ways_scenes() -> str:
+    """Error over time by the tables of docs/results/strategies-scenes.md, equal energy and equal irradiance, for the
+    ways that are there for both rules and light one column at a time or a pattern."""
+    page = (FOLDER.parent / "results" / "strategies-scenes.md").read_text(encoding="utf-8")
+    cells: dict[tuple[Rule, str, str, float], str] = {}
+    for title, table in re.findall(r"^##+ ([^\n]* ms)$(.*?)(?=^#)", page, re.MULTILINE | re.DOTALL):
+        rule: Rule = "irradiance" if title.startswith("Equal irradiance") else "energy"
+        head, _, *lines = (line.strip("| ").split(" | ") for line in table.split("\n") if line.startswith("|"))
+        time_ms = float(title.removesuffix(" ms").split()[-1])
+        for way, *values in lines:
+            cells.update(
+                ((rule, air, way.strip("`"), time_ms), value)
+                for air, value in zip(head, values, strict=True)
+                if value != "-"
+            )
+    both = {way for rule, _, way, _ in cells if rule == "irradiance"} - {"line-2-joint", "line-4-joint"}
+    return time_svg([
+        StrategyRow(way, find_strategy(way).light, "five scenes of 1.5 to 6 m", air, rule, time_ms, 1,
+                    mean_px=float(value.split(" / ")[0]))
+        for (rule, air, way, time_ms), value in cells.items()
+        if way in both
+    ])  # fmt: skip
+
+
 def _smaller(values: Array, times: int = 7) -> Array:
     """Medians of squares of `times` pixels; NaN where most pixels have none."""
     rows, width = (size // times for size in values.shape)
@@ -169,6 +198,7 @@ FIGURES: Mapping[str, Callable[[], str]] = {
     "clocks": clocks,
     "laser-safety": safety,
     "first-fog-map": pictures,
+    "other-ways-scenes": other_ways_scenes,
 }
 """Makers of figures by the name of their file."""
 

@@ -165,7 +165,7 @@ class SyncSource(Device):
                 raise LimitExceeded(f"{where} lasts {pulse.duration_s!r}; give a number of seconds")
             elif not math.isfinite(pulse.duration_s):
                 raise LimitExceeded(f"{where} lasts {pulse.duration_s:g} s; give a time, or None to wait for a sweep")
-            elif not pulse.duration_s >= self.resolution_s / 2:
+            elif pulse.duration_s < self.resolution_s / 2:
                 raise LimitExceeded(
                     f"{where} lasts {pulse.duration_s:g} s, under the resolution {self.resolution_s:g} s; lengthen it"
                 )

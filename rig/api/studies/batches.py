@@ -225,19 +225,19 @@ def _cases_and_table(study: Study) -> _Made:
     config = single.pop("config", SIMULATED)
     fields = {_FIELDS[key]: [*values] for key, values in lists.items()}
     options: dict[str, Any] = {**single, **fields, "seed": study.seed, "repeat": study.repeat}
-    about: tuple[str, ...] = ()
     if study.do == "tradeoff":
         cases, write = tradeoffs.as_cases(config, TradeoffRequest(**options))
     else:
         cases, write = strategies.as_cases(config, StrategiesRequest(**options))
-        about = notes_of(find_strategy(case.inputs["way"]) for case in cases)
     kept = kept_cases(cases, study.omit)
+    wanted = list(compress(cases, kept))
+    ways = dict.fromkeys(case.inputs["way"] for case in wanted) if study.do == "strategies" else ()
 
     def write_kept(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
         there = iter(found)
         return write(folder, [next(there) if keep else None for keep in kept], aborted)
 
-    return _Made(list(compress(cases, kept)), write_kept, study.do, about)
+    return _Made(wanted, write_kept, study.do, notes_of(map(find_strategy, ways)))
 
 
 _FIELDS = {

@@ -116,12 +116,12 @@ def test_a_study_of_strategies_has_the_rows_of_the_comparison(tmp_path: Path) ->
 def test_a_study_says_that_patterns_are_protected(tmp_path: Path) -> None:
     """As `rig tradeoff --strategies` does. One millisecond is too short for these patterns, and quickly done."""
     set_ = {"config": "small", "scene": "ramp", "fog": "clear", "rule": "energy", "rows": 4, "time": "1ms"}
-    done = api.batch(
-        {"do": "strategies", "set": set_, "vary": {"strategy": ["bch", "gray-spad"]}}, out=tmp_path / "out"
-    )
-    (note,) = done.batch.notes
+    study = {"do": "strategies", "set": set_, "vary": {"strategy": ["bch", "gray-spad"]}}
+    (note,) = api.batch(study, out=tmp_path / "out").batch.notes
     assert note.startswith("bch: ")
     assert "simulation for comparison only" in note
+    without_it = api.batch({**study, "omit": [{"strategy": "bch"}]}, out=tmp_path / "without")
+    assert without_it.batch.notes == ()
 
 
 @pytest.mark.usefixtures("here")
