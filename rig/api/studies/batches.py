@@ -180,7 +180,7 @@ class _Made:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What must be shown, and a sentence on settings that mean the same, if there are some: they are one case."""
+        """The lines of `about`, and a sentence on settings that mean the same, if there are some: they are one case."""
         first: dict[str, Case] = {}
         same = []
         for case in self.cases:
