@@ -27,7 +27,7 @@ from calibration.errors import FileError
 from calibration.files.sections import load_yaml
 from drivers.optional_packages import install_command
 from rig.batch.case import changed_file, checksum, code_digest
-from rig.batch.pool import Limits, Pool
+from rig.batch.pool import KEPT_FREE, Limits, Pool
 from rig.batch.store import Store
 from rig.batch.task import HEAD, Ended, Status, Task
 from rig.errors import RigError, UsageError
@@ -60,9 +60,14 @@ TAKEN_S: Final = 120.0
 """Seconds in which a batch system takes the first jobs."""
 JOB_OVER_S: Final = 30.0
 """Seconds without any of its workers after which a job counts as over: one that has crashed starts again sooner."""
+END_S: Final = 5.0
+"""Longest time to wait for workers to end the processes of a batch."""
 MOST_NAMED: Final = 5
 
-_of_thread = threading.local()
+_pools: dict[tuple[str, int], Pool] = {}
+"""On a worker: the processes that do cases, by batch and thread."""
+_over: set[str] = set()
+"""On a worker: batches that have ended while a parcel of theirs was still there."""
 _log = logging.getLogger(__name__)
 
 
@@ -92,9 +97,11 @@ class Cluster:
         self._parcel: list[Task] = []
         self._sent: dict[str, tuple[Future[Any], list[str]]] = {}
         self._under_way = 0
+        self._begun = False
         self._case_s = PARCEL_S
         # Other batches on the same scheduler may have the same cases, and it does each key once.
-        self._keys = (f"parcel-{secrets.token_hex(8)}-{number}" for number in count())
+        self._batch = secrets.token_hex(8)
+        self._keys = (f"parcel-{self._batch}-{number}" for number in count())
         self._threads = 0
         self._looked_s = float("-inf")
         self._with_workers_s = time.monotonic()
@@ -163,8 +170,9 @@ class Cluster:
 
     def _send(self) -> None:
         tasks, self._parcel = self._parcel, []
+        self._begun = True
         key = next(self._keys)
-        future = self._client.submit(_do, tasks, self._limits, key=key, pure=False)
+        future = self._client.submit(_do, tasks, self._limits, self._batch, key=key, pure=False)
         self._sent[key] = future, [task.name for task in tasks]
         future.add_done_callback(self._ended.put)
 
@@ -212,12 +220,22 @@ class Cluster:
                 self._client.cancel([future for future, _ in self._sent.values()], force=True)
         elif self._seen:
             self._count()  # for the notes: a worker may have gone since the last look
+        if self._begun and self._client.status == "running":
+            # A worker that does not answer has no processes of ours for long: they end with it.
+            ending = threading.Thread(target=self._end_processes, daemon=True)
+            ending.start()
+            ending.join(END_S)
         self._sent.clear()
         self._parcel.clear()
         self._under_way = 0
         if self._close is not None:
             self._close()
             self._close = None
+
+    def _end_processes(self) -> None:
+        """End the processes of this batch on all workers, whatever they do."""
+        with contextlib.suppress(OSError, TimeoutError, RuntimeError):
+            self._client.run(_end_batch, self._batch, on_error="ignore")
 
     def _judged(self, ended: Ended) -> Ended:
         """A task that came back undone from a worker that cannot do any is to be begun again elsewhere, unless the
@@ -247,19 +265,11 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
 
     Raises UsageError if a package is missing, no scheduler answers, or the file is wrong.
     """
-    try:
-        distributed = import_module("distributed")
-    except ImportError as error:
-        raise UsageError(f"`cluster` needs the package distributed; {install_command('distributed')}") from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells of every worker that comes and goes
+    distributed = _distributed()
     if "://" in cluster:
-        try:
-            _require_answer(cluster)
-            client = distributed.Client(cluster, timeout=FIRST_ANSWER_S, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise UsageError(f"no scheduler answers at {cluster} ({error}); start one with `dask scheduler`") from error
+        client = _client_at(cluster)
         return Cluster(store, client, limits, close=client.close)
-    queue, jobs = _batch_system(Path(cluster))
+    queue, jobs = _batch_system(*_jobs_in(Path(cluster)))
     client = distributed.Client(queue, timeout=PATIENCE_S, set_as_default=False)
 
     def close() -> None:
@@ -267,6 +277,41 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
         queue.close()
 
     return Cluster(store, client, limits, close=close, looked=Jobs(queue, jobs).renew)
+
+
+def workers_of(cluster: str) -> int:
+    """Number of cases that are done at once on what `--cluster` names: threads of the workers that are there now, or of
+    all jobs that a file asks for. Raises UsageError as `connect` does, and if no worker is there."""
+    if "://" not in cluster:
+        _, content, jobs = _jobs_in(Path(cluster))
+        cores = content.get("cores")
+        if not isinstance(cores, int) or cores < 1:
+            raise UsageError(f"{cluster}: cores is {cores!r}; it is the number of cores of a job, 1 or more")
+        return jobs * cores
+    _distributed()
+    with _client_at(cluster) as client:
+        threads = sum(map(int, client.nthreads().values()))
+    if not threads:
+        raise UsageError(f"no worker is at {cluster}; start some with `dask worker {cluster}`")
+    return threads
+
+
+def _distributed() -> Any:
+    try:
+        distributed = import_module("distributed")
+    except ImportError as error:
+        raise UsageError(f"`cluster` needs the package distributed; {install_command('distributed')}") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells of every worker that comes and goes
+    return distributed
+
+
+def _client_at(address: str) -> "Client":
+    try:
+        _require_answer(address)
+        client: Client = _distributed().Client(address, timeout=FIRST_ANSWER_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise UsageError(f"no scheduler answers at {address} ({error}); start one with `dask scheduler`") from error
+    return client
 
 
 class Jobs:
@@ -326,15 +371,15 @@ SYSTEMS: Final = {
 """Batch systems, by the class of dask-jobqueue; `local` starts the jobs as processes of this computer, for trials."""
 
 
-def _batch_system(file: Path) -> tuple[Any, int]:
-    """The jobs that a file describes, as a cluster of dask-jobqueue, and their number. Raises UsageError."""
+def _jobs_in(file: Path) -> tuple[Path, dict[str, Any], int]:
+    """A file that describes jobs, its content without their number, and that. Raises UsageError."""
     try:
         content = dict(load_yaml(file, "a cluster", "system: slurm").content)
     except FileError as error:
         raise UsageError(
             f"`cluster={file}` is no cluster ({'; '.join(error.problems)}); name local, tcp://HOST:PORT or a YAML file"
         ) from error
-    system, jobs = content.pop("system", None), content.pop("jobs", None)
+    system, jobs = content.get("system"), content.pop("jobs", None)
     problems = []
     if system not in SYSTEMS:
         problems.append(f"{file}: system is {system!r}; it is one of {', '.join(SYSTEMS)}")
@@ -342,11 +387,16 @@ def _batch_system(file: Path) -> tuple[Any, int]:
         problems.append(f"{file}: jobs is {jobs!r}; it is the number of jobs to ask for, 1 or more")
     if problems:
         raise UsageError.of(problems)
+    return file, content, jobs
+
+
+def _batch_system(file: Path, content: dict[str, Any], jobs: int) -> tuple[Any, int]:
+    """Jobs, as a cluster of dask-jobqueue, and their number. Raises UsageError."""
     try:
         module = _dask_jobqueue()
     except ImportError as error:
         raise UsageError(f"{file} needs the package dask-jobqueue; {install_command('dask-jobqueue')}") from error
-    place, _, name = SYSTEMS[system].rpartition(".")
+    place, _, name = SYSTEMS[content.pop("system")].rpartition(".")
     kind = getattr(import_module(f"dask_jobqueue.{place}") if place else module, name)
     try:
         made = kind(**content)
@@ -366,45 +416,66 @@ def _dask_jobqueue() -> Any:
             signal.signal(signal.SIGINT, before)
 
 
-def _do(parcel: Sequence[Task], limits: Limits) -> tuple[list[Ended], float]:
+def _do(parcel: Sequence[Task], limits: Limits, batch: str) -> tuple[list[Ended], float]:
     """Do the tasks of a parcel on a worker, one after the other, as long as PARCEL_S allows to begin one.
+
+    batch: a text that no other batch has.
 
     Also returns the wall time that each took, in seconds, with all that is done around it.
     """
     begun_s = time.monotonic()
+    mine = batch, threading.get_ident()
     done: list[Ended] = []
     for task in parcel:
-        if done and (time.monotonic() - begun_s > PARCEL_S or done[-1].status in UNFIT):
+        if batch in _over or (done and (time.monotonic() - begun_s > PARCEL_S or done[-1].status in UNFIT)):
             break
         try:
-            done.append(_on_worker(task, limits))
+            done.append(_on_worker(task, limits, batch))
         except Exception as error:  # too many open files, no room for another process: the next may succeed
-            _close_pool()
+            _close_pool(mine)
             time.sleep(LOOK_S)  # others take cases meanwhile
             done.append(Ended(task.name, "lost", f"its worker could not begin it: {error or type(error).__name__}"))
-    case_s = (time.monotonic() - begun_s) / len(done)
+    if batch in _over:  # a process at work at its end was left to this thread
+        _close_pool(mine)
+    case_s = (time.monotonic() - begun_s) / max(1, len(done))
     return [*done, *(Ended(task.name, "not begun") for task in parcel[len(done) :])], case_s
 
 
-def _on_worker(task: Task, limits: Limits) -> Ended:
-    """Do a task in the process that belongs to this thread of a dask worker."""
+def _on_worker(task: Task, limits: Limits, batch: str) -> Ended:
+    """Do a task in the process that belongs to this batch and this thread of a dask worker."""
     from distributed import get_worker
 
-    name = f"{get_worker().address} {socket.gethostname()}"
-    pool, its_limits = getattr(_of_thread, "pool", (None, None))
-    if pool is None or its_limits != limits:  # the first task, or the first of another study
-        _close_pool()
-        pool = Pool(1, limits, name)
-        _of_thread.pool = pool, limits
+    worker = get_worker()
+    mine = batch, threading.get_ident()
+    pool = _pools.get(mine)
+    if pool is None:
+        share = _share_bytes(worker.memory_manager.memory_limit, worker.state.nthreads, limits.memory_bytes)
+        pool = Pool(1, Limits(limits.time_s, share), f"{worker.address} {socket.gethostname()}")
+        _pools[mine] = pool
     pool.submit(task)
-    while not (ended := pool.wait()):
-        pass
-    return ended[0]
+    while batch not in _over:
+        if ended := pool.wait():
+            return ended[0]
+    return Ended(task.name, "lost", "its batch has ended")
 
 
-def _close_pool() -> None:
-    pool, _ = getattr(_of_thread, "pool", (None, None))
-    _of_thread.pool = None, None
+def _share_bytes(worker_bytes: int | None, threads: int, case_bytes: int | None) -> int | None:
+    """Most memory of a case: a thread's share of what its dask worker was given, if that is less than the study's limit
+    for a case. None where there is no limit."""
+    given = [case_bytes, worker_bytes and int((1 - KEPT_FREE) * worker_bytes / threads)]
+    return min((each for each in given if each), default=None)
+
+
+def _end_batch(batch: str) -> None:
+    """End the processes of a batch on this worker. A thread that waits for its process ends that itself."""
+    _over.add(batch)
+    for name, pool in list(_pools.items()):
+        if name[0] == batch and pool.room:
+            _close_pool(name)
+
+
+def _close_pool(name: tuple[str, int]) -> None:
+    pool = _pools.pop(name, None)
     if pool is not None:
         pool.close()
 

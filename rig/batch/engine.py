@@ -10,12 +10,13 @@ import time
 from array import array
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Final, Literal, Protocol
 
 from rig.batch.store import FAILURES, Store, failure_files, read_failures
-from rig.batch.task import Ended, Status, Task
+from rig.batch.task import Ended, Status, Task, result_file
 from rig.errors import UsageError
 from rig.interrupts import ignore_interrupts, one_interrupt
 from rig.progress import Progress, tell_stage
@@ -306,7 +307,8 @@ class _Told:
             left_s = (now_s - self._begun_s) / ended * (len(runs.waiting) + len(runs.under_way))
             notes.append(f"{in_words(left_s)} left")
         if runs.failed:
-            notes.append(f"{len(runs.failed)} failed")
+            kinds = Counter(ended.status for ended in runs.failed.values()).most_common()
+            notes.append(f"{len(runs.failed)} failed ({', '.join(f'{number} {kind}' for kind, number in kinds)})")
         # A line for each stage goes to where there is no terminal: one for each tenth of the cases.
         stage = f"cases, {10 * (10 * done // max(1, self._total))} %"
         if not executor.workers:
@@ -327,27 +329,36 @@ def in_words(seconds: float) -> str:
 
 
 def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
-    """Try a few cases and close the executor. Returns their wall times in seconds, without that of the first to end,
-    which loads compiled code, if there are others.
+    """Try a few cases, each twice, and close the executor. Returns the wall times of the second tries in seconds.
 
-    scratch: a store of all cases, in a folder that nobody needs. most: number of cases tried at most. Raises UsageError
-    if one of them fails.
+    In its first try a case loads compiled code and opens its scene, which a batch does once for many cases.
+
+    scratch: a store of all cases, in a folder that nobody needs. executor: with one worker, so that both tries of a
+    case are in one process. most: number of cases tried at most. Raises UsageError if one of them fails.
     """
     names = list(scratch.cases)
     # One of each part of the list, and any of it: their names are digests. With equal steps through a list that goes
     # around a few settings, all cases tried could have the same one.
     ends = [i * len(names) // most for i in range(most + 1)]
     some = [min(names[first:end]) for first, end in pairwise(ends) if first < end]
-    runs = _Runs(scratch, executor, some, 0)
-    try:
-        for _ in runs.steps():
-            tell_stage("trying cases, which load compiled code first", runs.n_done, len(some), "done")
-    finally:
-        executor.close()
-    if runs.failed:
-        first = next(iter(runs.failed.values()))
-        if first.status == "other code":
+    times_s = []
+    with closing(executor):
+        for number, name in enumerate(some):
+            tell_stage("trying cases, which load compiled code first", number, len(some), "done")
+            _try(scratch, executor, name)
+            result_file(scratch.folder, name).unlink()
+            times_s.append(_try(scratch, executor, name))
+    return times_s
+
+
+def _try(scratch: Store, executor: Executor, name: str) -> float:
+    """Do a case once; returns its wall time in seconds. Raises UsageError if it fails."""
+    runs = _Runs(scratch, executor, [name], 0)
+    for _ in runs.steps():
+        pass
+    for ended in runs.failed.values():
+        if ended.status == "other code":
             raise UsageError("the program was changed while cases were tried; run the command again")
-        setting = setting_of(scratch.cases[first.name].labels)
-        raise UsageError(f"case {first.name} ({setting}) fails: {first.message}; `--case {first.name}` does it alone")
-    return list(runs.times_s[1:] or runs.times_s)  # in the first one the process loads compiled code
+        setting = setting_of(scratch.cases[name].labels)
+        raise UsageError(f"case {name} ({setting}) fails: {ended.message}; `--case {name}` does it alone")
+    return runs.times_s[-1]

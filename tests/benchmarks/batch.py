@@ -59,7 +59,7 @@ def idle(x: int) -> dict[str, Any]:
     return {"x": x}
 
 
-def on_light_worker(task: Task, limits: Limits) -> Ended:
+def on_light_worker(task: Task, limits: Limits, batch: str) -> Ended:
     """What a dask worker does with a task, without a process for it."""
     time.sleep(random.expovariate(1 / DELAY_S))
     return perform(task, "light")

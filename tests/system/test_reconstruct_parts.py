@@ -30,9 +30,26 @@ def whole(recording, tmp_path_factory) -> Path:
     return out
 
 
-def test_all_files_of_maps_are_the_same_and_so_are_the_figures(recording, whole, tmp_path, monkeypatch):
+@pytest.fixture
+def of_dask():
+    """The address of a dask scheduler with two workers, each with processes of its own for cases."""
+    distributed = pytest.importorskip("distributed")
+    options = {"processes": False, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with distributed.LocalCluster(n_workers=2, **options) as cluster:
+        yield {"cluster": cluster.scheduler_address}
+
+
+@pytest.fixture
+def of_this_computer():
+    """Two worker processes of this computer."""
+    return {"workers": 2}
+
+
+@pytest.mark.parametrize("whose", ["of_this_computer", "of_dask"])
+def test_all_files_of_maps_are_the_same_and_so_are_the_figures(recording, whole, whose, tmp_path, monkeypatch, request):
     monkeypatch.setattr("rig.api.studies.parts.MAPS_OF_A_PART", 2)
-    result = api.reconstruct_parts(recording, request=api.ReconstructRequest(out=tmp_path / "parts"), workers=2)
+    workers = request.getfixturevalue(whose)
+    result = api.reconstruct_parts(recording, request=api.ReconstructRequest(out=tmp_path / "parts"), **workers)
     assert result.folder == tmp_path / "parts"
     names = sorted(str(file.relative_to(whole)) for file in whole.glob("*/*"))
     assert len(names) > 8 * MAPS

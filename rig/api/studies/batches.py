@@ -69,9 +69,9 @@ class BatchPlan:
 
     cases: number of all cases, or of those in the shard if the request names one.
     left: number of these that have no result in `out`.
-    workers: cases at once, on this computer.
-    case_s: mean wall time of a case in seconds, with one thread, found by trying a few.
-    tried_s: wall time of each that was tried, in seconds.
+    workers: cases at once.
+    case_s: mean wall time of a case in seconds, with one thread of this computer, found by trying a few.
+    tried_s: wall time of each that was tried, in seconds, once its compiled code and its scene are there.
     wall_s: estimated time of all that are left, in seconds.
     """
 
@@ -122,17 +122,22 @@ def batch(
 
 
 def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes: Any) -> BatchPlan:
-    """Count the cases of a study and estimate how long it takes on this computer (`rig batch --dry-run`).
+    """Count the cases of a study and estimate how long it takes (`rig batch --dry-run`).
 
-    A few cases are done, in a folder that is removed again. Raises UsageError as `batch` does, and if one fails.
+    A few cases are done on this computer, in a folder that is removed again. On a cluster, all cores count as this
+    computer's. Raises UsageError as `batch` does, and if a case fails.
     """
     request = replace(request or BatchRequest(), **changes)
     loaded, shard = _checked(study, request)
-    if request.cluster not in (None, OWN_PROCESSES):
-        raise UsageError("only this computer can say how long cases take; leave `cluster` out")
     made = _made(loaded)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
-    workers = request.workers or usual_workers(limits)
+    if request.cluster in (None, OWN_PROCESSES):
+        workers = request.workers or usual_workers(limits)
+    else:
+        _refuse_workers(request)
+        from rig.batch.cluster import workers_of
+
+        workers = workers_of(str(request.cluster))
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="spadrig-batch-")))
         scratch = stack.enter_context(Store(place / "probe", made.cases))
@@ -253,14 +258,18 @@ def executor_of(request: BatchRequest, store: Store, limits: Limits, client: "Cl
     try:
         if client is None and request.cluster in (None, OWN_PROCESSES):
             return Pool(request.workers, limits)
-        if request.workers is not None:
-            raise UsageError("`workers` is for this computer; a cluster has the workers that were started for it")
+        _refuse_workers(request)
         from rig.batch.cluster import Cluster, connect
 
         return connect(str(request.cluster), store, limits) if client is None else Cluster(store, client, limits)
     except BaseException:
         store.give_up()
         raise
+
+
+def _refuse_workers(request: BatchRequest) -> None:
+    if request.workers is not None:
+        raise UsageError("`workers` is for this computer; a cluster has the workers that were started for it")
 
 
 def _write_tables(store: Store, made: _Made, aborted: bool) -> None:

@@ -183,7 +183,10 @@ def test_the_command_does_a_study_and_one_case_of_it_alone(rig: Rig, monkeypatch
     assert planned.code == 0
     assert "cases: 1, to be done: 1" in planned.out
     assert "cases: 0, to be done: 0" in rig("batch", "study.yaml", "--dry-run", "--shard", "2/2").out
-    for wrong, said in ("--workers -2", "--workers is -2; it must"), ("--cluster tcp://h:1", "leave --cluster out"):
+    for wrong, said in (
+        ("--workers -2", "--workers is -2; it must"),
+        ("--cluster tcp://127.0.0.1:1", "no scheduler answers"),
+    ):
         (problem,) = rig("batch", "study.yaml", "--dry-run", *wrong.split()).problems
         assert said in problem
     assert "since cases that were tried took " in planned.out

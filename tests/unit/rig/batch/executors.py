@@ -65,11 +65,11 @@ WITH_OLD_CODE: set[str] = set()
 _really = cluster._on_worker
 
 
-def on_worker(task: Task, limits: Limits) -> Ended:
+def on_worker(task: Task, limits: Limits, batch: str) -> Ended:
     """What a dask worker does with a task, if some have old code."""
     from distributed import get_worker
 
     address = get_worker().address
     if address in WITH_OLD_CODE:
         return Ended(task.name, "other code", "another version of the code is installed", worker=f"{address} host")
-    return _really(task, limits)
+    return _really(task, limits, batch)

@@ -19,7 +19,7 @@ import pytest
 
 from rig.batch import cluster as module
 from rig.batch.case import Case, checksum
-from rig.batch.cluster import AHEAD, JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect
+from rig.batch.cluster import AHEAD, JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect, workers_of
 from rig.batch.engine import Batch, run_batch
 from rig.batch.pool import Limits
 from rig.batch.store import Store
@@ -141,6 +141,58 @@ def test_an_interrupt_takes_back_what_was_sent(tmp_path: Path, client: Any, monk
     assert run(tmp_path / "out", squares(50), client).verdict == "aborted"
     monkeypatch.undo()
     assert run(tmp_path / "out", squares(50), client).verdict == "complete"
+
+
+def test_processes_of_a_batch_end_with_it_and_those_of_another_stay(tmp_path: Path, client: Any) -> None:
+    with Store(tmp_path / "longer", squares(2)) as store:
+        longer = Cluster(store, client)
+        longer.submit(store.task(store.names[0]))
+        while not longer.wait():
+            pass
+        assert run(tmp_path / "out", squares(12), client).verdict == "complete"
+        assert {batch for batch, _ in module._pools} == {longer._batch}
+        longer.close()
+    assert module._pools == {}
+
+
+def test_a_case_at_work_is_ended_with_its_batch(tmp_path: Path, client: Any) -> None:
+    cases = troubles("hang", tmp_path / "counts")
+    with Store(tmp_path / "out", cases) as store:
+        executor = Cluster(store, client)
+        executor.submit(store.task(store.names[0]))
+        executor.wait()
+        until_s = time.monotonic() + 20
+        while not module._pools and time.monotonic() < until_s:
+            time.sleep(0.01)
+        (pool,) = module._pools.values()
+        executor.close()
+    while module._pools and time.monotonic() < until_s:
+        time.sleep(0.01)
+    assert module._pools == {}
+    assert not [process for process in pool._busy if process.alive]
+
+
+@pytest.mark.parametrize(
+    ("worker_bytes", "threads", "case_bytes", "most"),
+    [(10 << 30, 4, 2 << 30, 2 << 30), (4_000_000_000, 4, 2 << 30, 900_000_000), (None, 4, 7, 7), (0, 4, None, None)],
+)
+def test_a_case_takes_no_more_memory_than_its_threads_share(
+    worker_bytes: int | None, threads: int, case_bytes: int | None, most: int | None
+) -> None:
+    assert module._share_bytes(worker_bytes, threads, case_bytes) == most
+
+
+def test_the_workers_of_a_cluster_are_counted(tmp_path: Path, cluster: Any) -> None:
+    assert workers_of(cluster.scheduler_address) == 2
+    file = tmp_path / "jobs.yaml"
+    file.write_text("system: slurm\njobs: 5\ncores: 8\n")
+    assert workers_of(str(file)) == 40
+    file.write_text("system: slurm\njobs: 5\ncores: many\n")
+    with pytest.raises(UsageError, match="cores is 'many'; it is the number of cores of a job, 1 or more"):
+        workers_of(str(file))
+    nobody = pytest.raises(UsageError, match=r"no worker is at .*; start some with `dask worker")
+    with distributed.LocalCluster(n_workers=0, **ALONE) as empty, nobody:
+        workers_of(empty.scheduler_address)
 
 
 def test_a_client_that_has_lost_its_scheduler_for_good_is_an_error(tmp_path: Path, cluster: Any) -> None:

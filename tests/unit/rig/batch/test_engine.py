@@ -6,6 +6,7 @@ import signal
 import tracemalloc
 from array import array
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from rig.batch import engine as module
 from rig.batch.case import Case
 from rig.batch.engine import LOST, Batch, in_words, probe, run_batch
 from rig.batch.store import Store, failure_files, read_failures
-from rig.batch.task import Ended, Status, Task, result_file
+from rig.batch.task import Ended, Status, Task, perform, result_file
 from rig.errors import RigError, UsageError
 from rig.progress import Step, listening
 from tests.unit.rig.batch.executors import TINY, Inline, squares, troubles
@@ -392,6 +393,31 @@ def test_without_workers_it_says_that_it_waits(tmp_path: Path, monkeypatch: pyte
     assert [step.note for step in steps[:3]] == ["waiting for workers", "waiting for workers", ""]
 
 
+def test_what_a_case_does_once_for_many_is_not_in_its_estimate(tmp_path: Path) -> None:
+    opened: set[str] = set()
+
+    def slow_at_first(task: Task) -> Ended:
+        first = task.name not in opened
+        opened.add(task.name)
+        return replace(perform(task), seconds=9.0 if first else 0.5)
+
+    with Store(tmp_path / "out", squares(3)) as store:
+        assert probe(store, Inline(slow_at_first)) == [0.5, 0.5, 0.5]
+
+
+def test_progress_tells_failures_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SAID_S", 0.0)
+    kinds: list[Status] = ["raised", "hung", "raised", "memory"]
+
+    def bad(task: Task) -> Ended | None:
+        return Ended(task.name, kinds.pop()) if kinds else None
+
+    steps: list[Step] = []
+    with Store(tmp_path / "out", squares(5)) as store, listening(steps.append):
+        run_batch(store, Inline(bad), retries=0)
+    assert any("4 failed (2 raised, 1 memory, 1 hung)" in step.note for step in steps), steps
+
+
 @pytest.mark.parametrize(("seconds", "words"), [(3.2, "3 s"), (99, "99 s"), (600, "10 min"), (36_000, "10.0 h")])
 def test_times_are_in_words(seconds: float, words: str) -> None:
     assert in_words(seconds) == words
@@ -400,8 +426,9 @@ def test_times_are_in_words(seconds: float, words: str) -> None:
 def test_a_probe_tries_a_few_cases_spread_over_the_batch(tmp_path: Path) -> None:
     executor = Inline()
     with Store(tmp_path / "out", squares(90)) as store:
-        assert len(probe(store, executor)) == 2, "the first one loads compiled code"
-        assert sorted(store.names.index(name) // 30 for name in executor.given) == [0, 1, 2]
+        assert len(probe(store, executor)) == 3
+        assert executor.given[::2] == executor.given[1::2], "twice each, since the first try opens what others share"
+        assert [store.names.index(name) // 30 for name in executor.given[::2]] == [0, 1, 2]
         assert len(store.finished()) == 3
     assert executor.closed
     with Store(tmp_path / "bad", squares(2)) as store, pytest.raises(UsageError, match=r"case .* fails: it raised"):
