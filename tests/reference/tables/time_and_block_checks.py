@@ -9,8 +9,11 @@
   The pulse g has the variance of the instrument and of a bin, sigma^2 + width^2 / 12.
 - Disparity of dots against the bound of a block with read noise s and photons n: variance = sum of g^2 (n + s^2) over
   (sum of g^2)^2, with the picture's slope g per pixel of disparity.
-- Disparity of stereo by its fraction of a pixel, as the matcher gives it and after the blocks' parabola; the depth
-  error over z^2 / (b f) times the disparity error.
+- Disparity of stereo by its fraction of a pixel, as the matcher gives it and after the blocks' parabola.
+- Depth of stereo against z^2 / (b f) times the disparity's error of a block. The difference of both pictures has the
+  variance v = n1 + n2 + 2 s^2, and their slope, half the difference of two pixels, has v / 4. So the variance of the
+  disparity is the sum of (g^2 + v / 4) v over (sum of g^2)^2. The error that the matching itself makes, without any
+  noise, comes on top.
 """
 
 from __future__ import annotations
@@ -89,21 +92,45 @@ def dots_error_px(read_noise: float, inverse: float, seed: int = 5) -> tuple[flo
     return float(np.sqrt(np.mean(noisy / clean**2))), float(error.std()), float(error.mean())
 
 
-def stereo_errors_px(fraction: float, read_noise: float = 20.0) -> tuple[float, float, float, float, float]:
-    """Mean and standard deviation of the matcher's disparity error in pixels, the same after the blocks' parabola, and
-    the depth error over z^2 / (b f) times the disparity error."""
+def stereo_depth_error_mm(read_noise: float, inverse: float, seed: int = 3) -> tuple[float, float, float]:
+    """Standard deviation of the depth in millimetres: that which the formula gives for the noise of both pictures, that
+    of the matching itself, from pictures without noise, and that of noisy pictures.
+
+    The plane is a little slanted, so disparities have all fractions of a pixel.
+    """
+    scene = PlaneScene(lit=5e5, read_noise=read_noise, width=240, seed=seed, inverse=inverse, tilt=0.05)
+    means = scene.mean_pair(CAMERA_S)
+    answers = (
+        passive_stereo.depth_of_pair(1000 * means.astype(np.float32), scene.geometry),
+        passive_stereo.SGBM.measure(scene, scene.geometry, Budget(CAMERA_S), 0),
+    )
+    metre_per_px = scene.depth_m[INNER] ** 2 / (scene.baseline_m * scene.focal_px)
+    errors_m = [(answer.depth_m - scene.depth_m)[INNER] for answer in answers]
+    near = np.all(np.abs(errors_m) < metre_per_px, axis=0)
+    slope = np.gradient(means[0], axis=1)
+    noise = 2 * (means[0] + read_noise**2)  # a point is as bright in both pictures
+    of_noise, of_slope = (
+        cv2.blur(values, BLOCK_PX[::-1])[INNER] * np.prod(BLOCK_PX)
+        for values in ((slope**2 + noise / 4) * noise, slope**2)
+    )
+    expected_m = np.sqrt(np.mean((metre_per_px**2 * of_noise / of_slope**2)[near]))
+    matching_m, found_m = (error_m[near].std() for error_m in errors_m)
+    return 1e3 * float(expected_m), 1e3 * float(matching_m), 1e3 * float(found_m)
+
+
+def stereo_errors_px(fraction: float, read_noise: float = 20.0) -> tuple[float, float, float, float]:
+    """Mean and standard deviation of the matcher's disparity error in pixels, and the same after the blocks'
+    parabola."""
     scene = PlaneScene(lit=5e5, read_noise=read_noise, width=240)
     bf = scene.baseline_m * scene.focal_px
     scene = replace(scene, inverse=(27 + fraction) / bf)
     answer = passive_stereo.SGBM.measure(replace(scene), scene.geometry, Budget(CAMERA_S), 0)
     error = (bf * (1 / answer.depth_m - scene.inverse))[INNER]
-    depth_error = (answer.depth_m - 1 / scene.inverse)[INNER]
     shown = passive_stereo.detail_8_bits(scene.stereo_pair(CAMERA_S).astype(np.float32))[:, :, ::-1]
     found = passive_stereo.matched_by_opencv(*map(np.ascontiguousarray, shown), 10, 64)[:, ::-1]
     own = (found - bf * scene.inverse)[INNER]
     right, own = np.abs(error) < 1, own[np.abs(own) < 1]
-    ratio = depth_error[right].std() / (error[right].std() / scene.inverse**2 / bf)
-    return float(own.mean()), float(own.std()), float(error[right].mean()), float(error[right].std()), float(ratio)
+    return float(own.mean()), float(own.std()), float(error[right].mean()), float(error[right].std())
 
 
 def tables() -> Iterator[tuple[tuple[str, ...], Iterator[tuple[str, ...]]]]:
@@ -134,15 +161,27 @@ def tables() -> Iterator[tuple[tuple[str, ...], Iterator[tuple[str, ...]]]]:
         ),
     )
     yield (
+        ("stereo: fraction of a pixel", "matcher: mean, sd, px", "parabola: mean, sd, px"),
         (
-            "stereo: fraction of a pixel",
-            "matcher: mean, sd, px",
-            "parabola: mean, sd, px",
-            "depth / (z^2/bf disparity)",
-        ),
-        (
-            (f"{fraction:.2f}", f"{own:+.3f}, {own_sd:.3f}", f"{mean:+.3f}, {sd:.3f}", f"{ratio:.3f}")
+            (f"{fraction:.2f}", f"{own:+.3f}, {own_sd:.3f}", f"{mean:+.3f}, {sd:.3f}")
             for fraction in (0.0, 0.25, 0.5, 0.75)
-            for own, own_sd, mean, sd, ratio in (stereo_errors_px(fraction),)
+            for own, own_sd, mean, sd in (stereo_errors_px(fraction),)
+        ),
+    )
+    yield (
+        ("stereo: read noise, 1/z", "noise by the formula, mm", "matching, mm", "both, mm", "measured, mm", "ratio"),
+        (
+            (
+                f"{read:g}, {inverse:g}",
+                f"{noise:.2f}",
+                f"{matching:.2f}",
+                f"{both:.2f}",
+                f"{found:.2f}",
+                f"{found / both:.2f}",
+            )
+            for read in (100.0, 40.0, 7.0)
+            for inverse in (0.2, 0.31, 0.45)
+            for noise, matching, found in (stereo_depth_error_mm(read, inverse),)
+            for both in (math.hypot(noise, matching),)
         ),
     )

@@ -137,13 +137,17 @@ class PlaneScene:
 
     def stereo_pair(self, exposure_s: float) -> np.ndarray:
         self._spend(exposure_s)
+        mean = self.mean_pair(exposure_s)
+        noisy = self.rng.poisson(mean) + self.rng.normal(0, max(self.read_noise, 1e-9), mean.shape)
+        return np.clip(np.rint(noisy), 0, self.camera_full_scale).astype(np.uint16)
+
+    def mean_pair(self, exposure_s: float) -> np.ndarray:
+        """Mean photons (2, rows, width) of both views."""
         views = []
         for shift in (0.0, -self.baseline_m):
             u = np.broadcast_to(self.u, (self.rows_number, self.width))
             # The plane 1 = inverse z + tilt x meets the ray from x = shift.
             z = (1 - self.tilt * shift) / (self.inverse + self.tilt * u)
             x = shift + u * z
-            mean = exposure_s * (self.lit * self._painted(x / z, z) + self.haze + self.ambient)
-            noisy = self.rng.poisson(mean) + self.rng.normal(0, max(self.read_noise, 1e-9), mean.shape)
-            views.append(np.clip(np.rint(noisy), 0, self.camera_full_scale))
-        return np.array(views, np.uint16)
+            views.append(exposure_s * (self.lit * self._painted(x / z, z) + self.haze + self.ambient))
+        return np.array(views)
