@@ -228,7 +228,7 @@ def report_command(
     ] = None,
 ) -> CommandResult:
     """Write one HTML page on a run, or on two side by side: verdict, pictures, rows, errors, times, settings."""
-    with progress(compiles=False):
+    with progress():
         made = api.report(run, other, out=out, map=number)
 
     def show() -> None:

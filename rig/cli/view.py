@@ -39,7 +39,7 @@ def view_command(
             say("whoever has this address sees the scan and can stop it; Ctrl-C ends the page")
 
     with waiting:
-        waiting.enter_context(progress(compiles=False))
+        waiting.enter_context(progress())
         from rig.view.viewer import view
 
         view(run, request, ready=ready)

@@ -7,6 +7,7 @@ for the last map of an hour as for the first. Only a recording without markers i
 import multiprocessing
 import shutil
 import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -14,9 +15,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.errors import UsageError
+from rig.progress import Step, listening
 
 _END_S: Final = 2.0
 """Longest wait for the process to end when asked to, before it is killed."""
+_SAID_S: Final = 0.3
+"""Shortest time from one report of its stage to the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,8 @@ class Estimation:
 
     def __init__(self, request: EstimationRequest) -> None:
         self.request = request
+        self.stage = "starting; code that is not yet compiled takes minutes"
+        """Its present stage, in words."""
         self._folder = Path(tempfile.mkdtemp(prefix="spadrig-view-"))
         context = multiprocessing.get_context("spawn")  # threads of the server do not survive a fork
         self._answer, theirs = context.Pipe(duplex=False)
@@ -61,14 +67,17 @@ class Estimation:
         theirs.close()
 
     def poll(self) -> Estimated | None:
-        """The result once it is there, else None."""
-        if not self._answer.poll():
-            return None
-        try:
-            problem, number, summary = self._answer.recv()
-        except EOFError:
-            problem, number, summary = "the process that made it has died", 0, {}
-        return Estimated(self.request, None if problem else self._folder / "map", number, problem, summary)
+        """The result once it is there, else None, with `stage` brought up to date."""
+        while self._answer.poll():
+            try:
+                said = self._answer.recv()
+            except EOFError:
+                said = "the process that made it has died", 0, {}
+            if not isinstance(said, str):
+                problem, number, summary = said
+                return Estimated(self.request, None if problem else self._folder / "map", number, problem, summary)
+            self.stage = said
+        return None
 
     def close(self) -> None:
         """End the process, if it still runs, and remove its files."""
@@ -82,7 +91,8 @@ class Estimation:
 
 
 def _estimate(request: EstimationRequest, folder: Path, answer: Connection) -> None:
-    """Runs in the process: makes folder/map and answers with problem, number of the map in it, and summary."""
+    """Runs in the process: makes folder/map, and answers with its stages, each a text, and in the end with problem,
+    number of the map in it, and summary."""
     from calibration.errors import CalibrationError
     from drivers.errors import DeviceError
     from rig import api
@@ -95,13 +105,22 @@ def _estimate(request: EstimationRequest, folder: Path, answer: Connection) -> N
         "accept_calibration": True,
         "out": folder / "map",
     }
+    said_s = float("-inf")
+
+    def heard(step: Step) -> None:
+        nonlocal said_s
+        if time.monotonic() - said_s > _SAID_S:
+            answer.send(f"{step.stage}, {step.done} of {step.total} {step.unit}" if step.total else step.stage)
+            said_s = time.monotonic()
+
     try:
-        if request.by_cutting:
-            api.cut(request.run, folder / "part", maps=str(request.number))
-            result, number = api.reconstruct(folder / "part", **asked), 0
-        else:
-            result = api.replay(request.run, clock="max", maps=request.number + 1, save="last", **asked)
-            number = request.number
+        with listening(heard):
+            if request.by_cutting:
+                api.cut(request.run, folder / "part", maps=str(request.number))
+                result, number = api.reconstruct(folder / "part", **asked), 0
+            else:
+                result = api.replay(request.run, clock="max", maps=request.number + 1, save="last", **asked)
+                number = request.number
         answer.send(("", number, result.summary.as_json()))
     except (RigError, DeviceError, CalibrationError) as error:
         answer.send((" ".join(str(error).split()) or type(error).__name__, 0, {}))

@@ -119,6 +119,9 @@ class _Shows:
         self._estimated_again = False
         self._colour, self._least = "depth", 0.0
         self._limits: Limits | None = None
+        self._told_s = -np.inf
+        self._stale = False
+        """Whether the pages show the map in other colours than was asked for since."""
         self._answered: dict[int, object] = {}
 
     def __enter__(self) -> Self:
@@ -151,11 +154,18 @@ class _Shows:
         """Show a sentence on all pages, in the place of the one before."""
         self.pages.tell("notice", {"text": text})
 
+    @property
+    def due(self) -> bool:
+        """Whether the pages may be told a map again: not more often than was asked for."""
+        return time.monotonic() - self._told_s >= 1.0 / self._asked.view_rate
+
     def tell_map(self) -> None:
         """Tell the pages the shown map: points, pictures and its description."""
+        self._stale = False
         shown = self._shown
         if shown is None:
             return
+        self._told_s = time.monotonic()
         self._limits = steady_limits(self._limits, shown.depth_m)
         found = points(shown, self._colour, self._least, self._asked.view_points, self._limits)
         told: dict[str, Any] = {
@@ -193,8 +203,13 @@ class _Shows:
             self._least = min(max(wish.values["least"], 0.0), 1.0)
         else:
             return False
-        self.tell_map()
+        self._stale = True
         return True
+
+    def catch_up(self) -> None:
+        """Tell the shown map again if another colour or confidence was asked for, and it is time."""
+        if self._stale and self.due:
+            self.tell_map()
 
     def answer_rows(self, following: Sequence[PageWish], news: object = None) -> None:
         """Tell each page about the pixel under its cursor, if that or the map has changed. news: another object
@@ -260,7 +275,6 @@ class _ShowsLive(_Shows):
         self._figures: list[health.Figure] = []
         self._align: list[health.Figure] = []
         self._state: LiveState | None = None
-        self._told_s = -np.inf
         self._parent = os.getppid() if hasattr(os, "getppid") else 0
         self._tell_setup({}, "waiting for a scan")
         self.look_from_camera(5.0)
@@ -273,10 +287,10 @@ class _ShowsLive(_Shows):
                 self.say("The scan was asked to stop, as by Ctrl-C.")
         if following:
             self._source.follow(following[-1].values["row"])
-        due = time.monotonic() - self._told_s >= 1.0 / self._asked.view_rate
         slot = self._source.slot
-        news = self._source.poll(maps=due)
+        news = self._source.poll(maps=self.due)
         self._take(news, begun=self._source.slot is not slot)
+        self.catch_up()
         self.answer_rows(following, self._source.newest_row)
         over = self._source.state in (LiveState.ENDED, LiveState.LOST) or os.getppid() != self._parent
         return not (self._asked.until_closed and over and not self.pages.open)
@@ -312,12 +326,10 @@ class _ShowsLive(_Shows):
             self.pages.tell("profile", {"profile": np.nan_to_num(news.profile)})
         if news.map is not None:
             self._shown, self._label = news.map, f"map {news.map.number}"
-            self._told_s = time.monotonic()
             self.tell_map()
             self._tell_fog(news.map)
         elif news.frames is not None and (self._shown is None or not self._shown.stripe):
             self._shown, self._label = news.frames, "the newest frames, no map yet"
-            self._told_s = time.monotonic()
             self.tell_map()
         if self._source.state is not self._state:
             self._state = self._source.state
@@ -354,6 +366,9 @@ class _ShowsRun(_Shows):
         super().__init__(request)
         self._source = source
         self._again: Estimation | None = None
+        self._wanted: int | None = None
+        """Number of the map that was asked for last, until it is shown."""
+        self._stage = ""
         self.title = source.folder.absolute().name
         told = {
             "live": False,
@@ -385,14 +400,22 @@ class _ShowsRun(_Shows):
         for wish in wishes:
             if self.take_common(wish):
                 continue
-            if wish.ask == "map" and wish.values["index"] in self._source.numbers:
-                self._select(wish.values["index"])
-            elif wish.ask == "recorded" and self._shown is not None:
+            if wish.ask == "map":
+                self._wanted = wish.values["index"] if wish.values["index"] in self._source.numbers else self._wanted
+                continue
+            self._select_wanted()
+            if wish.ask == "recorded" and self._shown is not None:
                 self._select(self._shown.number)
             elif wish.ask == "estimate" and self._source.recorded and wish.values["estimator"] in estimator_names():
                 self._begin(wish.values["estimator"])
-        if self._again is not None and (made := self._again.poll()) is not None:
-            self._take(made)
+        if self.due:
+            self._select_wanted()
+        self.catch_up()
+        if self._again is not None:
+            if (made := self._again.poll()) is not None:
+                self._take(made)
+            elif self._again.stage != self._stage:
+                self._tell_estimate(self._again)
         self.answer_rows(following)
         return True
 
@@ -403,6 +426,11 @@ class _ShowsRun(_Shows):
     def why_no_counts(self, number: int) -> str:
         """The reason why the run has none."""
         return "the frames of this map are not recorded" if self._source.recorded else "this run has no recording"
+
+    def _select_wanted(self) -> None:
+        number, self._wanted = self._wanted, None
+        if number is not None:
+            self._select(number)
 
     def _select(self, number: int) -> None:
         try:
@@ -436,7 +464,12 @@ class _ShowsRun(_Shows):
         except UsageError as error:
             self.say(str(error))
             return
-        self.pages.tell("estimate", {"busy": True, "text": f"estimating map {asked.number} with {estimator}"})
+        self._tell_estimate(self._again)
+
+    def _tell_estimate(self, again: Estimation) -> None:
+        self._stage = again.stage
+        text = f"estimating map {again.request.number} with {again.request.estimator}: {again.stage}"
+        self.pages.tell("estimate", {"busy": True, "text": text})
 
     def _take(self, made: Estimated) -> None:
         assert self._again is not None, "it was polled"

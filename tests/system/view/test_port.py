@@ -25,6 +25,7 @@ from rig.errors import UsageError
 from rig.view.access import Access, listen
 from rig.view.pages import MOST_PAGES, Pages
 from rig.view.server import ViewServer, require_viser
+from rig.view.viewer import MOST_RATE_HZ
 from tests.system.conftest import Rig
 from tests.system.view.conftest import PATIENCE_S, Served, served
 
@@ -224,6 +225,22 @@ def test_a_client_that_floods_is_cut_off_and_others_go_on(guarded: Served, path:
         calm.send('{"ask": "colour", "by": "signal"}')
         while told(calm, "map")["colour"] != "signal":
             pass
+
+
+def test_however_often_colours_are_asked_for_points_are_sent_no_more_often_than_the_page_may(guarded: Served) -> None:
+    with open_socket(guarded.port, "/data", cookie=COOKIE) as link:
+        told(link, "picture-confidence")
+        begun_s = time.monotonic()
+        for i in range(60):
+            link.send(json.dumps({"ask": "confidence", "least": 0.01 * (i % 7)}))
+            link.send(json.dumps({"ask": "map", "index": i % 2}))
+            time.sleep(0.03)
+        link.send(json.dumps({"ask": "confidence", "least": 0.5}))
+        sent = 1
+        while told(link, "map")["least"] != 0.5:
+            sent += 1
+        assert 5 < sent <= 2 + MOST_RATE_HZ * (time.monotonic() - begun_s)
+        link.send(json.dumps({"ask": "confidence", "least": 0.0}))
 
 
 def test_a_message_too_large_or_nonsense_ends_the_client_that_sent_it(guarded: Served) -> None:

@@ -1,11 +1,17 @@
 """The page of a finished run in a real browser: points, pictures, the row under the cursor, downloads."""
 
+import socket
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from drivers.recorded import RunRecording
 from rig import api
@@ -30,6 +36,38 @@ def test_points_and_pictures_appear_and_nothing_is_asked_of_another_host(shown: 
     assert "complete" in tab.page.inner_text("#health")
     assert len([address for address in tab.asked if address.startswith("ws:")]) == 2
     tab.screenshot("run-desktop")
+
+
+def test_from_another_address_the_page_asks_for_its_token_and_outlives_a_flood(
+    scanned: Path, slots: Path, open_tab: Open
+) -> None:
+    """As from another computer: by the address of this one in its network, which is not loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
+        try:
+            route.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            pytest.skip("this computer is in no network: it has loopback alone")
+        address = str(route.getsockname()[0])
+    with served(scanned, "--host", address, folder=slots) as viewer:
+        assert urlsplit(viewer.url).hostname == address
+        without_token = viewer.url.partition("?")[0]
+        tab = open_tab(without_token)
+        assert "token" in tab.page.inner_text("body")
+        assert tab.page.evaluate("typeof latest") == "undefined"
+        tab = open_tab(viewer.url)
+        points = tab.cloud()
+        cookies = {each["name"]: each["value"] for each in tab.page.context.cookies()}
+        headers = {"Cookie": "; ".join(f"{name}={value}" for name, value in cookies.items())}
+        origin = Origin(without_token.rstrip("/"))
+        with connect(f"ws://{address}:{viewer.port}/data", origin=origin, additional_headers=headers) as flood:
+            for _ in range(100_000):
+                with suppress(ConnectionClosed):
+                    flood.send('{"ask": "colour", "by": "signal"}')
+                if flood.close_code is not None:
+                    break
+            assert flood.close_code == 1008
+        tab.page.select_option("#colour", "confidence")
+        tab.cloud(unlike=points)
 
 
 def test_the_page_fits_a_phone(shown: Served, open_tab: Open) -> None:
