@@ -7,6 +7,7 @@ frozen dataclass. All that a strategy knows of the rig is its `ColumnGeometry`: 
 """
 
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -31,6 +32,9 @@ GOOD: Final = 0.02
 """Largest error of a good answer, as a share of the depth."""
 BEYOND: Final = 0.1
 """An answer may lie beyond the depth range by this share of the inverse depth at its end, as in depth maps."""
+
+MOST_SIMILAR: Final = 8
+"""Most names that are told in place of a wrong one."""
 
 
 class TooShort(Exception):  # noqa: N818 - not an error: the comparison shows that there is no such measurement
@@ -223,8 +227,15 @@ def find_strategy(name: str) -> Strategy:
     Raises UsageError, with a message of one line, if there is none, if two packages offer it, if it cannot be loaded,
     if it calls itself by another name, or if its light is none of `Light`.
     """
+    entries = tuple(added(GROUP))
+    names = sorted({entry.name for entry in entries})
+    if name not in names:
+        similar = [each for each in names if name and name in each][:MOST_SIMILAR]
+        similar = similar or get_close_matches(name, names, MOST_SIMILAR)
+        said = f"similar ones are {', '.join(similar)}" if similar else f"choose one of: {', '.join(names)}"
+        raise UsageError(f"no strategy is named {name!r}; {said}, or install the package that has it")
     try:
-        found = load_entry("strategies", name, added(GROUP), Strategy)  # type: ignore[type-abstract]
+        found = load_entry("strategies", name, entries, Strategy)  # type: ignore[type-abstract]
     except UnknownKind as error:
         raise UsageError(str(error)) from error
     if found.name != name:

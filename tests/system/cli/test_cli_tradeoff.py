@@ -117,7 +117,7 @@ def test_options_of_one_kind_of_trial_are_refused_with_the_other(rig: Rig, small
     for options, said in (
         (("--strategies", "line-argmax", "--exposures", "3"), "--exposures says nothing with --strategies"),
         (("--times", "2ms"), "--times, --rules, --rows and --lux are for --strategies"),
-        (("--strategies", "nonsense"), "unknown kind 'nonsense'"),
+        (("--strategies", "nonsense"), "no strategy is named 'nonsense'; "),
     ):
         ran = rig("tradeoff", small, *options)
         assert ran.code == 2

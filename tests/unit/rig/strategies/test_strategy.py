@@ -92,8 +92,17 @@ def test_unknown_broken_and_doubled_names_are_said_in_one_line(monkeypatch):
         EntryPoint("striped", f"{__name__}:STRIPED", group),
     ]
     monkeypatch.setattr(module, "added", lambda group: entries)
-    for name, said in (("gone", "cannot be loaded"), ("twice", "offered twice"), ("other", "calls itself"),
-                       ("number", "is no"), ("none", "unknown kind"), ("striped", "one of spot")):  # fmt: skip
+    problems = {
+        "gone": "cannot be loaded",
+        "twice": "offered twice",
+        "other": "calls itself",
+        "number": "is no",
+        "xyz": "no strategy is named 'xyz'; choose one of: gone, number, other, striped, twice, or install",
+        "the": "similar ones are other, or install",
+        "twise": "similar ones are twice, or install",
+        "striped": "one of spot",
+    }
+    for name, said in problems.items():
         with pytest.raises(UsageError, match=said) as error:
             find_strategy(name)
         assert "\n" not in str(error.value)
