@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SHOWN = ("numpy", "numba", "opencv-contrib-python-headless", "pydantic", "typer")
 """Distributions whose versions the table shows."""
-OF_USERS = ("compress", "exchange", "nidaq", "testing", "view")
+OF_USERS = ("cluster", "compress", "exchange", "nidaq", "testing", "view")
 """Extras whose lowest versions are tried too."""
 _BOUND = re.compile(r"([A-Za-z0-9._-]+)(\[[a-z,]+\])?>=([0-9.]+)")
 _VERSION = re.compile(r"3\.(1[1-9])")
