@@ -10,12 +10,15 @@ is retired as soon as that is noticed; its cases go to others.
 import contextlib
 import logging
 import os
+import re
 import secrets
+import shutil
 import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from itertools import count
 from pathlib import Path
@@ -60,14 +63,19 @@ TAKEN_S: Final = 120.0
 """Seconds in which a batch system takes the first jobs."""
 JOB_OVER_S: Final = 30.0
 """Seconds without any of its workers after which a job counts as over: one that has crashed starts again sooner."""
+IDLE_S: Final = 120.0
+"""Longest time for which a process on a worker waits for its next case."""
 END_S: Final = 5.0
 """Longest time to wait for workers to end the processes of a batch."""
 MOST_NAMED: Final = 5
 
-_pools: dict[tuple[str, int], Pool] = {}
-"""On a worker: the processes that do cases, by batch and thread."""
+_idle: dict[tuple[str, int], tuple[Pool, float]] = {}
+"""On a worker: pools that wait for their next case, by batch and thread, with the time since when. Whoever takes a pool
+out of here, in one step, is the only one to use or close it."""
 _over: set[str] = set()
-"""On a worker: batches that have ended while a parcel of theirs was still there."""
+"""On a worker: batches that have ended, whose parcels may still be there."""
+_watching = threading.Lock()
+"""On a worker: held by the thread that ends pools which have waited for long."""
 _log = logging.getLogger(__name__)
 
 
@@ -269,7 +277,7 @@ def connect(cluster: str, store: Store, limits: Limits) -> Cluster:
     if "://" in cluster:
         client = _client_at(cluster)
         return Cluster(store, client, limits, close=client.close)
-    queue, jobs = _batch_system(*_jobs_in(Path(cluster)))
+    queue, jobs = _batch_system(Path(cluster))
     client = distributed.Client(queue, timeout=PATIENCE_S, set_as_default=False)
 
     def close() -> None:
@@ -283,7 +291,7 @@ def workers_of(cluster: str) -> int:
     """Number of cases that are done at once on what `--cluster` names: threads of the workers that are there now, or of
     all jobs that a file asks for. Raises UsageError as `connect` does, and if no worker is there."""
     if "://" not in cluster:
-        _, content, jobs = _jobs_in(Path(cluster))
+        content, jobs = _jobs_in(Path(cluster))
         cores = content.get("cores")
         if not isinstance(cores, int) or cores < 1:
             raise UsageError(f"{cluster}: cores is {cores!r}; it is the number of cores of a job, 1 or more")
@@ -310,7 +318,9 @@ def _client_at(address: str) -> "Client":
         _require_answer(address)
         client: Client = _distributed().Client(address, timeout=FIRST_ANSWER_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise UsageError(f"no scheduler answers at {address} ({error}); start one with `dask scheduler`") from error
+        raise UsageError(
+            f"no scheduler answers at {address} ({error}); correct the address, or start one with `dask scheduler`"
+        ) from error
     return client
 
 
@@ -369,13 +379,19 @@ SYSTEMS: Final = {
     "local": "local.LocalCluster",
 }
 """Batch systems, by the class of dask-jobqueue; `local` starts the jobs as processes of this computer, for trials."""
+SUBMITS: Final = {
+    "slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub", "htcondor": "condor_submit", "oar": "oarsub",
+}  # fmt: skip
+"""Commands with which dask-jobqueue hands in jobs."""
 
 
-def _jobs_in(file: Path) -> tuple[Path, dict[str, Any], int]:
-    """A file that describes jobs, its content without their number, and that. Raises UsageError."""
+def _jobs_in(file: Path) -> tuple[dict[str, Any], int]:
+    """The content of a file that describes jobs, without their number, and that. Raises UsageError."""
     try:
         content = dict(load_yaml(file, "a cluster", "system: slurm").content)
     except FileError as error:
+        if re.fullmatch(r"[\w.-]+:\d+", str(file), re.ASCII):
+            raise UsageError(f"`cluster={file}` is no cluster; the address of a scheduler is tcp://{file}") from error
         raise UsageError(
             f"`cluster={file}` is no cluster ({'; '.join(error.problems)}); name local, tcp://HOST:PORT or a YAML file"
         ) from error
@@ -387,16 +403,20 @@ def _jobs_in(file: Path) -> tuple[Path, dict[str, Any], int]:
         problems.append(f"{file}: jobs is {jobs!r}; it is the number of jobs to ask for, 1 or more")
     if problems:
         raise UsageError.of(problems)
-    return file, content, jobs
+    return content, jobs
 
 
-def _batch_system(file: Path, content: dict[str, Any], jobs: int) -> tuple[Any, int]:
-    """Jobs, as a cluster of dask-jobqueue, and their number. Raises UsageError."""
+def _batch_system(file: Path) -> tuple[Any, int]:
+    """The jobs that a file describes, as a cluster of dask-jobqueue, and their number. Raises UsageError."""
+    content, jobs = _jobs_in(file)
     try:
         module = _dask_jobqueue()
     except ImportError as error:
         raise UsageError(f"{file} needs the package dask-jobqueue; {install_command('dask-jobqueue')}") from error
-    place, _, name = SYSTEMS[content.pop("system")].rpartition(".")
+    system = content.pop("system")
+    if (command := SUBMITS.get(system)) and shutil.which(command) is None:
+        raise UsageError(f"{file}: {system} needs the command {command}, which is not here; start this where it is")
+    place, _, name = SYSTEMS[system].rpartition(".")
     kind = getattr(import_module(f"dask_jobqueue.{place}") if place else module, name)
     try:
         made = kind(**content)
@@ -424,7 +444,6 @@ def _do(parcel: Sequence[Task], limits: Limits, batch: str) -> tuple[list[Ended]
     Also returns the wall time that each took, in seconds, with all that is done around it.
     """
     begun_s = time.monotonic()
-    mine = batch, threading.get_ident()
     done: list[Ended] = []
     for task in parcel:
         if batch in _over or (done and (time.monotonic() - begun_s > PARCEL_S or done[-1].status in UNFIT)):
@@ -432,52 +451,72 @@ def _do(parcel: Sequence[Task], limits: Limits, batch: str) -> tuple[list[Ended]
         try:
             done.append(_on_worker(task, limits, batch))
         except Exception as error:  # too many open files, no room for another process: the next may succeed
-            _close_pool(mine)
             time.sleep(LOOK_S)  # others take cases meanwhile
             done.append(Ended(task.name, "lost", f"its worker could not begin it: {error or type(error).__name__}"))
-    if batch in _over:  # a process at work at its end was left to this thread
-        _close_pool(mine)
     case_s = (time.monotonic() - begun_s) / max(1, len(done))
     return [*done, *(Ended(task.name, "not begun") for task in parcel[len(done) :])], case_s
 
 
 def _on_worker(task: Task, limits: Limits, batch: str) -> Ended:
     """Do a task in the process that belongs to this batch and this thread of a dask worker."""
+    mine = batch, threading.get_ident()
+    pool = _idle.pop(mine, (None, 0.0))[0] or _new_pool(limits)
+    ended: list[Ended] = []
+    try:
+        pool.submit(task)
+        while not ended and batch not in _over:
+            ended = pool.wait()
+    finally:
+        if not ended:
+            pool.close()
+    if not ended:
+        return Ended(task.name, "lost", "its batch has ended")
+    _idle[mine] = pool, time.monotonic()
+    if batch in _over:  # since a moment ago: `_end_batch` may have looked before the pool was put back
+        _close_idle(mine)
+    return ended[0]
+
+
+def _new_pool(limits: Limits) -> Pool:
+    """A process of its own for a thread of this dask worker, with at most the thread's share of its memory."""
     from distributed import get_worker
 
     worker = get_worker()
-    mine = batch, threading.get_ident()
-    pool = _pools.get(mine)
-    if pool is None:
-        share = _share_bytes(worker.memory_manager.memory_limit, worker.state.nthreads, limits.memory_bytes)
-        pool = Pool(1, Limits(limits.time_s, share), f"{worker.address} {socket.gethostname()}")
-        _pools[mine] = pool
-    pool.submit(task)
-    while batch not in _over:
-        if ended := pool.wait():
-            return ended[0]
-    return Ended(task.name, "lost", "its batch has ended")
+    if _watching.acquire(blocking=False):
+        threading.Thread(target=_end_idle, daemon=True, name="spadrig-idle").start()
+    share = shared_limits(limits, worker.memory_manager.memory_limit, worker.state.nthreads)
+    return Pool(1, share, f"{worker.address} {socket.gethostname()}")
 
 
-def _share_bytes(worker_bytes: int | None, threads: int, case_bytes: int | None) -> int | None:
-    """Most memory of a case: a thread's share of what its dask worker was given, if that is less than the study's limit
-    for a case. None where there is no limit."""
-    given = [case_bytes, worker_bytes and int((1 - KEPT_FREE) * worker_bytes / threads)]
-    return min((each for each in given if each), default=None)
+def shared_limits(limits: Limits, worker_bytes: int | None, threads: int) -> Limits:
+    """Limits of a case on a dask worker: at most a thread's share of its memory, if it has a limit."""
+    share = int((1 - KEPT_FREE) * (worker_bytes or 0) / threads)
+    if not share or (limits.memory_bytes is not None and limits.memory_bytes <= share):
+        return limits
+    whose = "the share of one thread of its dask worker; start workers with more memory or fewer threads"
+    return replace(limits, memory_bytes=share, memory_of=whose)
 
 
 def _end_batch(batch: str) -> None:
     """End the processes of a batch on this worker. A thread that waits for its process ends that itself."""
     _over.add(batch)
-    for name, pool in list(_pools.items()):
-        if name[0] == batch and pool.room:
-            _close_pool(name)
+    for name in [name for name in list(_idle) if name[0] == batch]:
+        _close_idle(name)
 
 
-def _close_pool(name: tuple[str, int]) -> None:
-    pool = _pools.pop(name, None)
+def _close_idle(name: tuple[str, int]) -> None:
+    pool, _ = _idle.pop(name, (None, 0.0))
     if pool is not None:
         pool.close()
+
+
+def _end_idle() -> None:
+    """End processes that have waited for a case longer than IDLE_S: whoever leads their batch may be gone."""
+    while True:
+        time.sleep(IDLE_S / 10)
+        for name, (_, since_s) in list(_idle.items()):
+            if time.monotonic() - since_s > IDLE_S:
+                _close_idle(name)
 
 
 def _lost(name: str, future: "Future[Any]") -> Ended:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final
 
@@ -38,10 +38,14 @@ ONE_THREAD: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a case: wall time in seconds, and memory in bytes (None for a fair share of this computer's)."""
+    """Limits of a case: wall time in seconds, and memory in bytes (None for a fair share of this computer's).
+
+    memory_of: what the memory is, and how to get more, for the message of a case that takes too much.
+    """
 
     time_s: float = 3600.0
     memory_bytes: int | None = None
+    memory_of: str = "the study's memory_limit; raise it"
 
 
 def memory_bytes() -> int:
@@ -78,7 +82,10 @@ class Pool:
         limits = limits or Limits()
         self.workers = usual_workers(limits) if workers is None else workers
         share = int((1 - KEPT_FREE) * memory_bytes() / self.workers)
-        self._limits = Limits(limits.time_s, limits.memory_bytes or share)
+        if limits.memory_bytes is None:
+            whose = "its share of this computer's; do fewer cases at once"
+            limits = replace(limits, memory_bytes=share, memory_of=whose)
+        self._limits = limits
         self._replaced: Counter[str] = Counter()
         self._idle = [f"{name} {number}" for number in range(self.workers, 0, -1)]
         self._free: list[_Process] = []
@@ -171,6 +178,8 @@ class _Process:
         """Send a task."""
         self._task = task
         self._begun_s = time.monotonic()
+        self._printed.seek(0)  # the process writes at the same place
+        self._printed.truncate()
         try:
             self._stdin.write(task.as_line().encode())
             self._stdin.flush()
@@ -201,7 +210,8 @@ class _Process:
         assert limits.memory_bytes is not None, "the pool has set it"
         used = resident_bytes(self._process.pid)
         if used > limits.memory_bytes:
-            return self._end("memory", f"the case took {used / 1e9:.2g} GB, at most {limits.memory_bytes / 1e9:.2g} GB")
+            took, most = (f"{each / 1e9:.3g} GB" for each in (used, limits.memory_bytes))
+            return self._end("memory", f"the case took {took} with its process, more than {most}, {limits.memory_of}")
         return None
 
     def kill(self) -> None:

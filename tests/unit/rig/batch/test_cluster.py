@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +20,9 @@ import pytest
 
 from rig.batch import cluster as module
 from rig.batch.case import Case, checksum
-from rig.batch.cluster import AHEAD, JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect, workers_of
+from rig.batch.cluster import AHEAD, JOB_OVER_S, TAKEN_S, Cluster, Jobs, connect, shared_limits, workers_of
 from rig.batch.engine import Batch, run_batch
-from rig.batch.pool import Limits
+from rig.batch.pool import Limits, Pool
 from rig.batch.store import Store
 from rig.batch.task import Ended
 from rig.errors import RigError, UsageError
@@ -150,26 +151,52 @@ def test_processes_of_a_batch_end_with_it_and_those_of_another_stay(tmp_path: Pa
         while not longer.wait():
             pass
         assert run(tmp_path / "out", squares(12), client).verdict == "complete"
-        assert {batch for batch, _ in module._pools} == {longer._batch}
+        assert {batch for batch, _ in module._idle} == {longer._batch}
         longer.close()
-    assert module._pools == {}
+    assert module._idle == {}
 
 
-def test_a_case_at_work_is_ended_with_its_batch(tmp_path: Path, client: Any) -> None:
+def test_a_case_at_work_is_ended_with_its_batch(tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Pool] = []
+    close = Pool.close
+
+    def noted(self: Pool) -> None:
+        closed.append(self)
+        close(self)
+
+    monkeypatch.setattr(Pool, "close", noted)
     cases = troubles("hang", tmp_path / "counts")
     with Store(tmp_path / "out", cases) as store:
         executor = Cluster(store, client)
         executor.submit(store.task(store.names[0]))
         executor.wait()
         until_s = time.monotonic() + 20
-        while not module._pools and time.monotonic() < until_s:
-            time.sleep(0.01)
-        (pool,) = module._pools.values()
+        while not list((tmp_path / "counts").iterdir()) and time.monotonic() < until_s:
+            time.sleep(0.01)  # until it is at work
+        assert closed == []
         executor.close()
-    while module._pools and time.monotonic() < until_s:
+    while not closed and time.monotonic() < until_s:
         time.sleep(0.01)
-    assert module._pools == {}
-    assert not [process for process in pool._busy if process.alive]
+    assert len(closed) == 1
+    assert module._idle == {}
+
+
+def test_processes_that_nobody_gives_a_case_for_long_are_ended(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after the command that led the batch was killed: nobody ends its processes."""
+    monkeypatch.setattr(module, "IDLE_S", 0.5)
+    monkeypatch.setattr(module, "_watching", threading.Lock())
+    with Store(tmp_path / "out", squares(1)) as store:
+        abandoned = Cluster(store, client)
+        abandoned.submit(store.task(store.names[0]))
+        while not abandoned.wait():
+            pass
+    assert [batch for batch, _ in module._idle] == [abandoned._batch]
+    until_s = time.monotonic() + 20
+    while module._idle and time.monotonic() < until_s:
+        time.sleep(0.01)
+    assert module._idle == {}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +206,9 @@ def test_a_case_at_work_is_ended_with_its_batch(tmp_path: Path, client: Any) -> 
 def test_a_case_takes_no_more_memory_than_its_threads_share(
     worker_bytes: int | None, threads: int, case_bytes: int | None, most: int | None
 ) -> None:
-    assert module._share_bytes(worker_bytes, threads, case_bytes) == most
+    found = shared_limits(Limits(5.0, case_bytes), worker_bytes, threads)
+    assert (found.time_s, found.memory_bytes) == (5.0, most)
+    assert ("fewer threads" in found.memory_of) == (most not in (case_bytes, None))
 
 
 def test_the_workers_of_a_cluster_are_counted(tmp_path: Path, cluster: Any) -> None:
@@ -258,6 +287,24 @@ def test_a_file_that_is_no_cluster_is_refused_in_lines(tmp_path: Path, text: str
     gc.collect()
     for problem in problems:
         assert problem in said
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("slurm.yaml", "slurm.yaml: slurm needs the command sbatch, which is not here"),
+        ("lab-pc:8786", "`cluster=lab-pc:8786` is no cluster; the address of a scheduler is tcp://lab-pc:8786"),
+    ],
+)
+def test_what_cannot_be_reached_is_said_before_anybody_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, said: str
+) -> None:
+    (tmp_path / "slurm.yaml").write_text("system: slurm\njobs: 2")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with Store(tmp_path / "out", squares(2)) as store, pytest.raises(UsageError) as refused:
+        connect(given, store, Limits())
+    assert said in str(refused.value)
 
 
 @pytest.mark.parametrize(("package", "given"), [("distributed", "tcp://host:1"), ("dask_jobqueue", "slurm.yaml")])

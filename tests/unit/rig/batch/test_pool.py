@@ -45,7 +45,7 @@ def test_each_trouble_fails_its_own_case_alone(tmp_path: Path) -> None:
     assert {each.attempts for kind, each in kinds.items() if kind != "raised"} == {2}
     assert kinds["died"].message == "the process ended with signal 9"
     assert kinds["hung"].message == "the case took longer than 4 s"
-    assert kinds["memory"].message.endswith("at most 0.21 GB")
+    assert kinds["memory"].message.endswith("more than 0.21 GB, the study's memory_limit; raise it")
     assert [len(list((tmp_path / kind).iterdir())) for kind in ("raise", "die", "hang", "eat")] == [1, 2, 2, 2]
     assert left_processes() == []
 
