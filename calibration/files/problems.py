@@ -320,7 +320,7 @@ def _unknown_key(key: Key, schema: _Schema) -> str:
     if elsewhere is not None:
         meant = f"did you mean '{'.'.join(elsewhere)}'?{_then(elsewhere, schema, None).replace(';', '', 1)}"
     else:
-        meant = f"did you mean '{close[0]}'?" if close else f"keys here are {', '.join(known)}"
+        meant = f"did you mean '{'.'.join((*key[:-1], *close))}'?" if close else f"keys here are {', '.join(known)}"
     return f"unknown key '{'.'.join(key)}'; {meant}"
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 from rig.batch.store import FAILURES, Store, failure_files, read_failures
@@ -132,6 +133,7 @@ def run_batch(
         executor.close()
         raise
     runs = _Runs(store, executor, [name for name in mine if name not in finished], retries)
+    file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0] + 1}-of-{shard[1]}.jsonl")
     told = _Told(len(mine) - len(runs.waiting), len(mine), progress)
     aborted = False
     with one_interrupt():
@@ -150,28 +152,10 @@ def run_batch(
             except Exception as error:  # the table is written all the same
                 _log.warning("cannot end the workers in order: %s", error or type(error).__name__)
             there, packed = _packed(store, runs, finished, only=shard[1] == 1)
+            failures = _failures(store, runs, there, command)
+            all_tried = not (aborted or runs.stopped or runs.waiting or runs.under_way)
+            _write_failures(file, failures, packed, None if all_tried else there)
     done, total = len(there), len(store.cases)
-    for name in runs.done - there:
-        runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
-    failures = tuple(
-        Failure(
-            end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.tries(end.name),
-            f"{command} --case {end.name}", end.detail,
-        )
-        for end in runs.failed.values()
-    )  # fmt: skip
-    file = store.folder / (FAILURES if shard[1] == 1 else f"failures-{shard[0] + 1}-of-{shard[1]}.jsonl")
-    with contextlib.suppress(OSError):  # the disk is full: they are returned all the same
-        before = failure_files(store.folder) if packed else [file] if file.exists() else []
-        listed = [asdict(failure) for failure in failures]
-        if aborted or runs.stopped:  # those that failed before and were not tried again
-            again = {*there, *runs.failed}
-            listed += [line for line in read_failures(*before) if line["case"] not in again]
-        if listed:
-            replace_file(file, "".join(map(json_line, listed)).encode())
-        for old in before:
-            if old != file or not listed:
-                old.unlink()
     verdict: Literal["complete", "failures", "part", "stopped", "aborted"]
     if aborted:
         verdict = "aborted"
@@ -185,6 +169,38 @@ def run_batch(
         done, total, runs.n_done, failures, verdict, runs.stopped, time.monotonic() - begun, sum(runs.times_s),
         runs.most, tuple(executor.notes), packed, file.name,
     )  # fmt: skip
+
+
+def _failures(store: Store, runs: "_Runs", there: set[str], command: str) -> tuple[Failure, ...]:
+    """The failed cases. there: names of those that have a result."""
+    for name in runs.done - there:
+        runs.failed[name] = Ended(name, "lost", "its result was written, but is not there any more")
+    return tuple(
+        Failure(
+            end.name, dict(store.cases[end.name].labels), end.status, end.message, runs.tries(end.name),
+            f"{command} --case {end.name}", end.detail,
+        )
+        for end in runs.failed.values()
+    )  # fmt: skip
+
+
+def _write_failures(file: Path, failures: Sequence[Failure], packed: bool, there: set[str] | None) -> None:
+    """Write the file with the failed cases in place of older ones, if there are any.
+
+    packed: whether the table has been written; then the files of other shards go too. there: names of the cases that
+    have a result, if others were not tried again: those that failed before stay listed then. None if all were tried.
+    """
+    with contextlib.suppress(OSError):  # the disk is full: they are returned all the same
+        before = failure_files(file.parent) if packed else [file] if file.exists() else []
+        listed = [asdict(failure) for failure in failures]
+        if there is not None:
+            again = {*there, *(failure.case for failure in failures)}
+            listed += [line for line in read_failures(*before) if line["case"] not in again]
+        if listed:
+            replace_file(file, "".join(map(json_line, listed)).encode())
+        for old in before:
+            if old != file or not listed:
+                old.unlink()
 
 
 def _packed(store: Store, runs: "_Runs", finished: set[str], *, only: bool) -> tuple[set[str], bool]:
@@ -328,27 +344,35 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
-def probe(scratch: Store, executor: Executor, most: int = 3) -> list[float]:
-    """Try a few cases, each twice, and close the executor. Returns the wall times of the second tries in seconds.
+@dataclass(frozen=True, slots=True)
+class Probed:
+    """Wall times of cases that were tried, in seconds. again_s: of a second try of each. opening_s: longest time that a
+    first try took more, to load compiled code and to open what many cases share, such as a scene."""
 
-    In its first try a case loads compiled code and opens its scene, which a batch does once for many cases.
+    again_s: tuple[float, ...]
+    opening_s: float
+
+
+def probe(scratch: Store, executor: Executor, names: Sequence[str], most: int = 3) -> Probed:
+    """Try a few cases, each twice, and close the executor.
 
     scratch: a store of all cases, in a folder that nobody needs. executor: with one worker, so that both tries of a
-    case are in one process. most: number of cases tried at most. Raises UsageError if one of them fails.
+    case are in one process. names: of the cases of which some are tried. most: number of those at most. Raises
+    UsageError if one of them fails.
     """
-    names = list(scratch.cases)
     # One of each part of the list, and any of it: their names are digests. With equal steps through a list that goes
     # around a few settings, all cases tried could have the same one.
     ends = [i * len(names) // most for i in range(most + 1)]
     some = [min(names[first:end]) for first, end in pairwise(ends) if first < end]
-    times_s = []
+    first_s, again_s = [], []
     with closing(executor):
         for number, name in enumerate(some):
-            tell_stage("trying cases, which load compiled code first", number, len(some), "done")
-            _try(scratch, executor, name)
+            tell_stage(f"trying case {number + 1} of {len(some)}, which loads compiled code first")
+            first_s.append(_try(scratch, executor, name))
             result_file(scratch.folder, name).unlink()
-            times_s.append(_try(scratch, executor, name))
-    return times_s
+            again_s.append(_try(scratch, executor, name))
+    opening_s = max(max(0.0, first - again) for first, again in zip(first_s, again_s, strict=True))
+    return Probed(tuple(again_s), opening_s)
 
 
 def _try(scratch: Store, executor: Executor, name: str) -> float:

@@ -102,7 +102,9 @@ def _show_plan(plan: "BatchPlan") -> None:
     tell(f"cases: {plan.cases}, to be done: {plan.left}")
     if plan.left:
         times = " and ".join(f"{seconds:.2g} s" for seconds in sorted(plan.tried_s))
-        tell(f"about {in_words(plan.wall_s)} with {plan.workers} at once, since cases that were tried took {times}")
+        opening = f", and {plan.opening_s:.2g} s more in a process's first case" if plan.opening_s >= 0.1 else ""
+        wall = in_words(max(1.0, plan.wall_s))
+        tell(f"about {wall} with {plan.workers} at once: cases that were tried took {times}{opening}")
 
 
 def _show_batch(done: "BatchResult") -> None:

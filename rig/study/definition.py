@@ -81,16 +81,16 @@ class Study(BaseModel):
     memory_limit: str = "2 GB"
     retries: int = Field(default=2, ge=0)
 
-    @field_validator("time_limit")
+    @field_validator("time_limit", mode="before")
     @classmethod
-    def _time(cls, text: str) -> str:
+    def _time(cls, text: Any) -> Any:
         if not _amount(text, TIMES_S):
             raise ValueError(f"{text!r} is no time for a case; write it like '90 s', '10 min' or '2 h'")
         return text
 
-    @field_validator("memory_limit")
+    @field_validator("memory_limit", mode="before")
     @classmethod
-    def _memory(cls, text: str) -> str:
+    def _memory(cls, text: Any) -> Any:
         if not _amount(text, SIZES):
             raise ValueError(f"{text!r} is no size of memory; write it like '2 GB' or '500 MB'")
         return text
@@ -178,9 +178,9 @@ class Study(BaseModel):
         return (*dict.fromkeys(keys), "seed")
 
 
-def _amount(text: str, units: Mapping[str, float]) -> float:
-    """A number with one of these units; 0 if it is none."""
-    match = _AMOUNT.fullmatch(text)
+def _amount(text: Any, units: Mapping[str, float]) -> float:
+    """A number with one of these units; 0 if it is none, or no text."""
+    match = _AMOUNT.fullmatch(text) if isinstance(text, str) else None
     return float(match[1]) * units.get(match[2], 0.0) if match else 0.0
 
 

@@ -57,10 +57,9 @@ def test_all_files_of_maps_are_the_same_and_so_are_the_figures(recording, whole,
     assert filecmp.cmpfiles(whole, result.folder, names, shallow=False) == (names, [], [])
     one, parts = (json.loads((folder / "summary.json").read_text()) for folder in (whole, result.folder))
     assert {name: one[name] for name in FIGURES} == {name: parts[name] for name in FIGURES}
-    assert (
-        json.loads((whole / "manifest.json").read_text())["sweeps"]
-        == json.loads((result.folder / "manifest.json").read_text())["sweeps"]
-    )
+    manifests = [json.loads((folder / "manifest.json").read_text()) for folder in (whole, result.folder)]
+    for name in ("sweeps", "config", "devices", "calibration"):
+        assert manifests[0][name] == manifests[1][name]
     assert list(tmp_path.iterdir()) == [result.folder]
 
 

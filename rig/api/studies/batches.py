@@ -1,5 +1,6 @@
 """The calls that do studies, on this computer or on many: `batch`, `plan_batch`, `repeat_case`."""
 
+import math
 import os
 import re
 import shlex
@@ -15,11 +16,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rig.api import strategies, tradeoffs
 from rig.batch.case import Case, Result
-from rig.batch.engine import Batch, Executor, probe, run_batch, setting_of
+from rig.batch.engine import Batch, Executor, Probed, probe, run_batch, setting_of
 from rig.batch.pool import Limits, Pool, usual_workers
 from rig.batch.store import Row, Store, failure_files, read_failures, read_rows
 from rig.config.overrides import SIMULATED, PathLike
-from rig.errors import UsageError
+from rig.errors import RigError, UsageError
 from rig.interrupts import one_interrupt
 from rig.progress import Progress
 from rig.report.csv_file import csv_of
@@ -72,6 +73,7 @@ class BatchPlan:
     workers: cases at once.
     case_s: mean wall time of a case in seconds, with one thread of this computer, found by trying a few.
     tried_s: wall time of each that was tried, in seconds, once its compiled code and its scene are there.
+    opening_s: time that a process needs in its first case to load and open these, in seconds.
     wall_s: estimated time of all that are left, in seconds.
     """
 
@@ -81,6 +83,7 @@ class BatchPlan:
     case_s: float
     wall_s: float
     tried_s: tuple[float, ...] = ()
+    opening_s: float = 0.0
 
 
 def batch(
@@ -106,16 +109,21 @@ def batch(
     loaded, shard = _checked(study, request)
     if request.out is None:
         raise UsageError("a study is written into a folder; name one with `out`")
-    made = _made(loaded)
+    made = _made(loaded, study)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     folder = Path(request.out).absolute()
     content = {"study": loaded.model_dump(mode="json")}
     with one_interrupt(), Store(folder, made.cases, content, shared=shard[1] > 1) as store:
         executor = executor_of(request, store, limits, client)
         command = f"rig batch {_named(study)} --out {shlex.quote(str(request.out))}"
-        done = run_batch(
-            store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
-        )  # fmt: skip
+        try:
+            done = run_batch(
+                store, executor, shard=shard, retries=loaded.retries, progress=progress, command=command
+            )  # fmt: skip
+        except RigError:  # the cluster is lost, and nothing else
+            if shard[1] == 1:
+                _write_tables(store, made, aborted=True)
+            raise
         if done.packed:
             _write_tables(store, made, done.verdict == "aborted")
     return BatchResult(replace(done, notes=(*made.notes, *done.notes)), folder)
@@ -129,7 +137,7 @@ def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes:
     """
     request = replace(request or BatchRequest(), **changes)
     loaded, shard = _checked(study, request)
-    made = _made(loaded)
+    made = _made(loaded, study)
     limits = Limits(loaded.time_limit_s, loaded.memory_limit_bytes)
     if request.cluster in (None, OWN_PROCESSES):
         workers = request.workers or usual_workers(limits)
@@ -143,10 +151,11 @@ def plan_batch(study: StudyLike, request: BatchRequest | None = None, **changes:
         scratch = stack.enter_context(Store(place / "probe", made.cases))
         mine = list(scratch.cases)[shard[0] :: shard[1]]
         done = set() if request.out is None else scratch.finished_in(Path(request.out))
-        left = len(set(mine) - done)
-        tried_s = probe(scratch, Pool(1, limits)) if left else [0.0]
-    case_s = statistics.fmean(tried_s)
-    return BatchPlan(len(mine), left, workers, case_s, case_s * left / workers, tuple(tried_s))
+        todo = [name for name in mine if name not in done]
+        probed = probe(scratch, Pool(1, limits), todo) if todo else Probed((0.0,), 0.0)
+    case_s = statistics.fmean(probed.again_s)
+    wall_s = case_s * math.ceil(len(todo) / workers) + probed.opening_s
+    return BatchPlan(len(mine), len(todo), workers, case_s, wall_s, probed.again_s, probed.opening_s)
 
 
 def _checked(study: StudyLike, request: BatchRequest) -> tuple[Study, tuple[int, int]]:
@@ -161,7 +170,7 @@ def repeat_case(study: StudyLike, name: str) -> Result:
 
     Raises UsageError if the study has no case of this name, and whatever the case raises.
     """
-    made = _made(load_study(study))
+    made = _made(load_study(study), study)
     with tempfile.TemporaryDirectory(prefix="spadrig-case-") as place:
         with Store(Path(place) / "store", made.cases) as store:
             case = store.cases.get(name)
@@ -202,11 +211,13 @@ class _Made:
         )
 
 
-def _made(study: Study) -> _Made:
+def _made(study: Study, given: StudyLike) -> _Made:
+    """The cases of a study. given: the study as the caller has it, for messages."""
+    where = f"{os.fspath(given)}: " if isinstance(given, str | os.PathLike) else ""
     try:
         return _cases_and_table(study)
     except UsageError as error:
-        raise UsageError.of(map(_in_settings, error.problems)) from error
+        raise UsageError.of(where + _in_settings(problem) for problem in error.problems) from error
 
 
 def _in_settings(text: str) -> str:

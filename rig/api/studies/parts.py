@@ -1,7 +1,6 @@
 """Reconstruction of one recording in parts that are done at the same time, on this computer or on many."""
 
 import shutil
-import tempfile
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +15,7 @@ from rig.batch.case import Case
 from rig.batch.engine import run_batch
 from rig.batch.pool import Limits
 from rig.batch.store import Store
-from rig.batch.task import FILES
+from rig.batch.task import FILES, SCRATCH
 from rig.config.models import AUTO
 from rig.config.overrides import PathLike
 from rig.depth.knocks import KNOCKED, knocked
@@ -101,10 +100,12 @@ def reconstruct_parts(
         seams = range(MAPS_OF_A_PART, maps, MAPS_OF_A_PART)
         if moved := _knocked_at(seams, target, folder, file or str(folder / CALIBRATION_FILE)):
             summary = with_doubt(summary, KNOCKED, moved)
-        config = {**manifest["config"], "name": f"replay of {folder.name}"}
+        config = dict(manifest["config"])
         config["spad"] = {**config["spad"], "recording": str(folder.absolute())}
+        devices = dict(manifest["devices"])
+        devices["spad"] = {**devices["spad"], "name": f"replay of {folder.name}"}
         config["calibration"] = file or str(folder.absolute() / CALIBRATION_FILE)
-        content = {**manifest, "config": config, "parts": len(cases), "versions": versions()}
+        content = {**manifest, "config": config, "devices": devices, "parts": len(cases), "versions": versions()}
         target.write_json("manifest.json", {**content, "verdict": summary.verdict.value})
         target.write_json("summary.json", summary.as_json())
         published = target.publish()
@@ -117,10 +118,13 @@ def reconstruct_part(
 ) -> dict[str, Any]:
     """Make the maps `first` to `end` - 1 of a recording and write them as a run into the folder `keep`; returns figures
     of the run."""
-    with tempfile.TemporaryDirectory(prefix="spadrig-part-") as scratch:
-        part = Path(scratch) / "part"
+    # Beside `keep`: if this process is killed, both are removed with the batch.
+    part = Path(keep).with_name(f"{Path(keep).name.removesuffix(SCRATCH)}.frames{SCRATCH}")
+    try:
         cut(recording, part, maps=f"{first}:{end}")
         result = replay(part, clock="max", calibration=calibration, out=keep, **options).uninterrupted()
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     return {"maps": result.summary.maps, "verdict": result.summary.verdict.value, "fog": asdict(result.summary.fog)}
 
 

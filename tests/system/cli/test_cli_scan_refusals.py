@@ -27,7 +27,7 @@ def test_the_calibration_of_a_cube_is_refused_as_such(rig: Rig, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        ({"scan.colums": 500}, "unknown key 'scan.colums'; did you mean 'columns'?"),
+        ({"scan.colums": 500}, "unknown key 'scan.colums'; did you mean 'scan.columns'?"),
         ({"scan.columns": 3, "scan.exposures": 1}, "raise scan.exposures to"),
         ({"spad.kind": "simulatd"}, "choose one of"),
         ({"world.scene": "nowhere"}, "nowhere' is no file, no folder and none of the bundled"),

@@ -13,7 +13,7 @@ import pytest
 
 from rig.batch import engine as module
 from rig.batch.case import Case
-from rig.batch.engine import LOST, Batch, in_words, probe, run_batch
+from rig.batch.engine import LOST, Batch, Probed, in_words, probe, run_batch
 from rig.batch.store import Store, failure_files, read_failures
 from rig.batch.task import Ended, Status, Task, perform, result_file
 from rig.errors import RigError, UsageError
@@ -402,7 +402,7 @@ def test_what_a_case_does_once_for_many_is_not_in_its_estimate(tmp_path: Path) -
         return replace(perform(task), seconds=9.0 if first else 0.5)
 
     with Store(tmp_path / "out", squares(3)) as store:
-        assert probe(store, Inline(slow_at_first)) == [0.5, 0.5, 0.5]
+        assert probe(store, Inline(slow_at_first), store.names[:2]) == Probed((0.5, 0.5), 8.5)
 
 
 def test_progress_tells_failures_by_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -426,10 +426,10 @@ def test_times_are_in_words(seconds: float, words: str) -> None:
 def test_a_probe_tries_a_few_cases_spread_over_the_batch(tmp_path: Path) -> None:
     executor = Inline()
     with Store(tmp_path / "out", squares(90)) as store:
-        assert len(probe(store, executor)) == 3
+        assert len(probe(store, executor, store.names).again_s) == 3
         assert executor.given[::2] == executor.given[1::2], "twice each, since the first try opens what others share"
         assert [store.names.index(name) // 30 for name in executor.given[::2]] == [0, 1, 2]
         assert len(store.finished()) == 3
     assert executor.closed
     with Store(tmp_path / "bad", squares(2)) as store, pytest.raises(UsageError, match=r"case .* fails: it raised"):
-        probe(store, Inline(ends("raised")))
+        probe(store, Inline(ends("raised")), store.names)

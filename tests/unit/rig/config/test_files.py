@@ -70,7 +70,7 @@ def test_all_problems_are_listed_at_once_in_the_order_of_the_file(write):
         'rig.yaml:5: laser.max_power: 50 has no unit; write the power with a unit, like "50 mW"',
         "rig.yaml:6: sync: unknown kind 'simulate'; choose one of: prawndo, pulsestreamer, replay, "
         "simulated, teensy, or install the package that has it",
-        "rig.yaml:8: unknown key 'scan.colums'; did you mean 'columns'?",
+        "rig.yaml:8: unknown key 'scan.colums'; did you mean 'scan.columns'?",
         "rig.yaml:9: scan.exposures is -3, it must be at least 1; write for example 'exposures: 10'",
         'rig.yaml:10: scan.frame_rate: 97700 has no unit; write the frequency with a unit, like "100 kHz"',
         "rig.yaml:11: scan.depth_range runs from 8 m to 1 m; it must be [near, far] with 0 m < near < far",
@@ -150,7 +150,7 @@ def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):
 
 def test_a_mistake_in_an_override_is_called_an_option(write):
     assert problems(write(RIG), {"scan.exposures": 0, "scan.colum": 3}) == [
-        "option: unknown key 'scan.colum'; did you mean 'columns'?",
+        "option: unknown key 'scan.colum'; did you mean 'scan.columns'?",
         "`exposures` is 0, it must be at least 1; write for example `exposures=10`",
     ]
 

@@ -57,7 +57,7 @@ PLACE = "rotation: [0 deg, 0 deg, 0 deg]\n  position: [0 m, 0 m, 1 m]"
         ("medium: {extinction: 0.1 /m, phase: {g: 2}}", "medium.phase.g is 2, it must be less than 1"),
         (
             f"surfaces: board\nboard:\n  {PLACE}\n  mirorred: true",
-            ":5: unknown key 'board.mirorred'; did you mean 'mir",
+            ":5: unknown key 'board.mirorred'; did you mean 'board.mir",
         ),
         (f"surfaces: board\nboard:\n- {PLACE}\n  mirrored: 3", ":5: board.0.mirrored is 3, it must be true or false"),
         ("", "is empty; a scene must hold keys and values, e.g. 'surfaces: street'"),
