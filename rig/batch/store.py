@@ -23,14 +23,13 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from rig.batch.case import MEASURED, Case, Result, checksum, code_digest, numeric_versions, package_of
-from rig.batch.task import CASE, CASES, FILES, HEAD, RESULT, SCRATCH, Task, read_result
+from rig.batch.task import CASE, CASES, FILES, HEAD, RESULT, SCRATCH, TABLE, Task, read_result
 from rig.errors import UsageError
 from rig.run_folder.disk import hold, replace_file, sync_folder
 from rig.run_folder.plain_json import json_line, json_text
 
 SCHEMA: Final = 1
 LIST: Final = "cases.jsonl"
-TABLE: Final = "table.jsonl"
 MEASUREMENTS: Final = "measured.jsonl"
 FAILURES: Final = "failures.jsonl"
 LOCK: Final = ".lock"

@@ -27,6 +27,7 @@ CASES: Final = "cases"
 FILES: Final = "files"
 """Folder with the files of cases that keep some, a folder each."""
 HEAD: Final = "study.json"
+TABLE: Final = "table.jsonl"
 CASE: Final = "case"
 RESULT: Final = "result"
 SCRATCH: Final = ".part"
@@ -109,6 +110,8 @@ def perform(task: Task, worker: str = "", *, raises: bool = False) -> Ended:
     try:
         result = dict(call(task.function, inputs))
         if task.keeps and not file.exists():
+            if kept.exists() and _in_table(folder, task.name):  # another attempt, and the table, were quicker
+                return Ended(task.name, "done", seconds=time.monotonic() - begun, worker=worker)
             _keep(scratch, kept)
         seconds = time.monotonic() - begun
         measured = {**dict(result.pop(MEASURED, {})), "seconds": seconds, "worker": worker}
@@ -135,6 +138,15 @@ def perform(task: Task, worker: str = "", *, raises: bool = False) -> Ended:
         said = f"cannot write {file}: {error.strerror}"
         return Ended(task.name, "cannot write", said, seconds=seconds, worker=worker)
     return Ended(task.name, "done", seconds=seconds, worker=worker)
+
+
+def _in_table(folder: Path, name: str) -> bool:
+    """Whether the table has been written with the result of this case."""
+    try:
+        with (folder / TABLE).open(encoding="utf-8") as lines:
+            return any(json.loads(line).get(CASE) == name for line in lines)
+    except (OSError, ValueError):
+        return False
 
 
 def _keep(scratch: Path, kept: Path) -> None:

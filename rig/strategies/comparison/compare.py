@@ -7,7 +7,6 @@ table is one strategy in one scene and air, with one rule and time.
 
 import math
 import statistics
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -18,6 +17,7 @@ import numpy as np
 
 from rig.batch.case import Case, Result, files_of
 from rig.batch.here import do_here
+from rig.compute_clock import computing
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.errors import RigError
@@ -74,7 +74,8 @@ class StrategyRow:
     mean_px, median_px, good, valid, confident_wrong: as in `Score`; None if the strategy needs more time. `too_short`
     then says how much. spread_px: standard deviation of mean_px over the seeds, None for one seed. median_mm: median
     depth error. range_m: farthest distance at which 90 % of the pixels are within 2 % of the depth, None if there is
-    none. spent_ms: sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included.
+    none. spent_ms: sensor time. energy_mj: energy of the light. compute_s: computing time, simulation included,
+    without compiling.
     laser_class: class of the source while it works; laser_class_still: its class if it stood still. Both are None
     without a source, or if its light is not visible.
     """
@@ -215,21 +216,21 @@ def _measured(scene: OpenScene, way: Strategy, rule: Rule, time_s: float, seeds:
     row = StrategyRow(way.name, way.light, place.name, place.air, rule, 1e3 * time_s, len(scene.true_m))
     classes = _classes(scene.config, scene.geometry, way.light, scene.power_w, rule, time_s)
     row = replace(row, laser_class=classes[0], laser_class_still=classes[1])
-    begun = time.perf_counter()
     scores: list[Score] = []
     reached = Reached(scene.true_m)
     spent: list[tuple[float, float]] = []
-    try:
-        for seed in seeds:
-            answer, used = _measure(scene, way, rule, time_s, seed)
-            spent.append((used.time_s, used.energy_j))
-            scores.append(score(answer, scene.truth, scene.geometry, scene.scored))
-            reached.add(answer.depth_m[scene.scored])
-    except TooShort as why:
-        return replace(row, too_short=str(why), compute_s=time.perf_counter() - begun)
-    spent_ms, energy_mj = (1e3 * statistics.fmean(each) for each in zip(*spent, strict=True))
-    row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=spent_ms, energy_mj=energy_mj)
-    return replace(row, compute_s=time.perf_counter() - begun)
+    with computing() as compute_s:
+        try:
+            for seed in seeds:
+                answer, used = _measure(scene, way, rule, time_s, seed)
+                spent.append((used.time_s, used.energy_j))
+                scores.append(score(answer, scene.truth, scene.geometry, scene.scored))
+                reached.add(answer.depth_m[scene.scored])
+        except TooShort as why:
+            return replace(row, too_short=str(why), compute_s=compute_s())
+        spent_ms, energy_mj = (1e3 * statistics.fmean(each) for each in zip(*spent, strict=True))
+        row = replace(row, **_means(scores), range_m=reached.range_m(), spent_ms=spent_ms, energy_mj=energy_mj)
+        return replace(row, compute_s=compute_s())
 
 
 def _measure(scene: OpenScene, way: Strategy, rule: Rule, time_s: float, seed: int) -> tuple[Answer, Spent]:

@@ -127,6 +127,27 @@ def test_a_case_begun_twice_keeps_its_files_once(tmp_path: Path, monkeypatch: py
     assert (tmp_path / "out" / "files" / task.name / "map.txt").read_text() == "1"
 
 
+def test_an_attempt_that_ends_after_the_table_was_written_leaves_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store(tmp_path / "out", [Case(f"{TINY}:keeping", {"x": 1}, keeps=True)]) as store:
+        task = store.task(store.names[0])
+
+        def late(function: str, inputs: dict[str, Any]) -> Any:
+            monkeypatch.undo()
+            assert perform(task).status == "done"
+            store.pack()
+            (kept,) = (tmp_path / "out" / "files").iterdir()
+            (kept / "first").touch()
+            return call(function, inputs)
+
+        monkeypatch.setattr(module, "call", late)
+        assert perform(task).status == "done"
+        (kept,) = [each for each in (tmp_path / "out" / "files").iterdir() if not each.name.startswith(".")]
+        assert (kept / "first").exists()
+        assert not list((tmp_path / "out").glob("cases/*/*.json"))
+
+
 def test_a_file_appears_whole_and_once_whoever_writes_it(tmp_path: Path) -> None:
     texts = [f"{number}" * 100_000 for number in range(8)]
     start = threading.Barrier(len(texts))
