@@ -17,13 +17,13 @@ import numpy as np
 
 from rig.batch.case import Case, Result, files_of
 from rig.batch.here import do_here
-from rig.compute_clock import computing
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.errors import RigError
 from rig.progress import tell_stage
 from rig.simd import Float32, Float64
 from rig.strategies.apparatus import Budget, Rule, Spent
+from rig.strategies.comparison.compute_clock import computing
 from rig.strategies.comparison.eye_safety import VISIBLE_M, Field, LaserClass, class_of
 from rig.strategies.comparison.places import OWN, scene_path, visibility_m
 from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene

@@ -4,8 +4,8 @@ import numba
 import pytest
 from numba.core import event
 
-from rig import compute_clock as module
-from rig.compute_clock import computing
+from rig.strategies.comparison import compute_clock as module
+from rig.strategies.comparison.compute_clock import computing
 
 
 class Clock:
