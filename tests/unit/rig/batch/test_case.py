@@ -55,14 +55,16 @@ def test_the_checksum_of_a_folder_sees_contents_and_names(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("name", "before", "after", "counts"),
     [
-        ("frames-000000.spb", "0000", "1111", False),
-        ("frames-000000.spb", "0000", "111", True),
+        ("frames-000000.spb", "0000", "1111", True),
+        ("frames-000000.spb", "0000", "000", True),
+        ("frames-000000.spb", "0" * 300_000, "0" * 299_999 + "1", True),
+        ("frames-000000.spb", "0" * 300_000, "0" * 100_000 + "1" + "0" * 199_999, False),
         ("calibration.yaml", "focal: 600", "focal: 900", True),
         ("learned/000000.npz", "0000", "1111", True),
         ("depth/000000.npy", "0000", "11", False),
     ],
 )
-def test_of_a_recording_counts_what_a_replay_reads_and_frames_by_their_size(
+def test_of_a_recording_counts_what_a_replay_reads_and_frames_by_size_and_ends(
     tmp_path: Path, name: str, before: str, after: str, counts: bool
 ) -> None:
     (tmp_path / INDEX_FILE).write_text("where all blocks are")
