@@ -8,7 +8,7 @@ import json
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from drivers.registry import SLOTS, kinds, lookup
+from rig import api
 from rig.config.bundled import BUNDLED
 from tests.system.conftest import Rig
 from tests.system.small_rig import HEIGHT, WIDTH, calibration, config
@@ -187,3 +188,31 @@ def test_a_notebook_runs_and_lies_there_without_outputs(notebook: Path, bundled:
         if cell["cell_type"] == "code":
             assert (cell["outputs"], cell["execution_count"]) == ([], None)
             exec(compile("".join(cell["source"]), str(notebook), "exec"), place)
+
+
+IN_WORDS = "versions", "config", "plan", "request", "rig", "devices", "calibration"
+"""Parts of a manifest of which the page says what is in them, but not each key."""
+
+
+def keys_in(content: Mapping[str, Any], before: str = "") -> Iterator[str]:
+    """Dotted names of all keys, those of the first element of lists included."""
+    for key, value in content.items():
+        yield before + key
+        part = value[0] if isinstance(value, list) and value else value
+        if isinstance(part, dict):
+            yield from keys_in(part, f"{before}{key}.")
+
+
+@pytest.mark.parametrize("file", ["summary.json", "manifest.json"])
+def test_the_page_of_run_folders_names_every_key(file: str, scanned: Path, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "reference" / "run-folder.md").read_text()
+    example = re.findall(r'"(\w+)":', page)
+    words = re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", page, flags=re.DOTALL))
+    named = {*example, *re.findall(r"\w+", " ".join(words))}
+    api.reconstruct(scanned, out=tmp_path / "maps")
+    for folder in (scanned, tmp_path / "maps"):
+        keys = list(keys_in(json.loads((folder / file).read_text())))
+        assert len(keys) > 40
+        for key in keys:
+            top, _, rest = key.partition(".")
+            assert key.rpartition(".")[2] in named or (rest and top in IN_WORDS), f"{key} is not in run-folder.md"
