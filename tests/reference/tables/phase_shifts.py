@@ -6,6 +6,7 @@ the variance 2 / N for N photons in all (`rig.strategies.patterns.phase_shift`).
 
 from __future__ import annotations
 
+import argparse
 from itertools import product
 from typing import Literal
 
@@ -38,6 +39,8 @@ def right_percent(scene: OpenScene, strategy: PhaseShift, time_s: float) -> str:
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.parse_args()
     numbers = range(FEWEST_SHIFTS, MOST_SHIFTS + 1)
     config = portable_content(load_config(SIMULATED))
     table = Table(["air, time, picked up by, Gray code", *(f"{shifts} shifts" for shifts in numbers)])

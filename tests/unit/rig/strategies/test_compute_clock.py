@@ -6,6 +6,9 @@ from numba.core import event
 
 from rig.strategies.comparison import compute_clock as module
 from rig.strategies.comparison.compute_clock import computing
+from tests.stability.inventory import covers
+
+covers(computing)
 
 
 class Clock:
