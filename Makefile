@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 demo: .venv/.installed  ## scan the simulated rig in a foggy street
 	$(BIN)/rig scan --out runs/demo-$$(date +%Y%m%d-%H%M%S)
-	@echo "next: $(BIN)/rig demo records such a scan, replays it, and shows it in the browser"
+	@echo "next: $(BIN)/python -m pip install -e '.[view]', then $(BIN)/rig demo, shows such a scan in the browser"
 
 install: .venv/.installed-tests  ## set up .venv with everything that tests need; again after a change of pyproject.toml
 
@@ -122,9 +122,11 @@ campaign-inputs: .venv/.installed-tests  ## INPUTS, or as many as 60 s of proces
 	$(PYTHON) -m venv .venv
 	touch $@
 .venv/.installed: pyproject.toml .venv/.created
+	@echo "installing into .venv, about a minute"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 .venv/.installed-tests: pyproject.toml .venv/.created
+	@echo "installing into .venv, about a minute"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[tests,docs]'
 	touch $@ .venv/.installed
 

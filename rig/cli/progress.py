@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.live import Live
     from rich.table import Table
 
-COMPILING = "loading compiled code, the first time two minutes or more"
+COMPILING = "compiling, the first time only: two to six minutes"
 PATIENCE_S = 2.0
 """Without a terminal, a command that takes less than this prints no progress."""
 BAR_CELLS = 20

@@ -29,7 +29,7 @@ def padded_lanes(pixels: int) -> int:
     return -(-pixels // (STEPS * LANES)) * LANES
 
 
-@numba.njit(forceinline=True)
+@numba.njit(forceinline=True, cache=True)  # called from Python too
 def pair_bytes(lanes: int) -> int:
     """Bytes from one pair to the next in a row of counts with `lanes` lanes."""
     return 2 * (lanes + 2 * PAD)

@@ -1,9 +1,10 @@
-"""Starts the process that shows the runs of this one in the browser: `rig view --live`.
+"""Starts the process that shows the runs of this one, and no others, in the browser: `rig view --live`.
 
 The process has its own session, so that it gets no Ctrl-C that is meant for the run. Nothing of the viewer is imported
 here. The process says on stderr where its page is.
 """
 
+import os
 import socket
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from typing import Final
 
 from drivers.optional_packages import install_command
 from rig.errors import UsageError
+from rig.progress import tell_stage
 from rig.requests import ViewRequest
 
 READY_S: Final = 20.0
@@ -42,17 +44,19 @@ def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.P
     if (problem := page_problem()) is not None:
         raise UsageError(problem)
     port = ViewRequest().port if port is None else port
-    command = [sys.executable, "-m", "spadrig", "view", "--live", "--port", str(port)]
+    command = [sys.executable, "-m", "spadrig", "view", "--live", "--port", str(port), "--process", str(os.getpid())]
+    tell_stage("starting the page")
     process = subprocess.Popen(
         [*command, *([] if stays else ["--until-closed"])],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         start_new_session=True,
     )
-    # Linux shares the processors among sessions first: the page's own niceness would count within its session only.
+    _wait(lambda: process.poll() is not None or _listens(port))
+    # Linux shares the processors among sessions first: the page's own niceness would count within its session only. It
+    # is told now, since the run waits for the page.
     with suppress(OSError):
         Path(f"/proc/{process.pid}/autogroup").write_text(str(NICE))
-    _wait(lambda: process.poll() is not None or _listens(port))
     return process
 
 

@@ -232,10 +232,10 @@ class SlotReader:
         return sorted(there, key=lambda slot: slot.started_unix_s, reverse=True)
 
     @staticmethod
-    def newest() -> RunningSlot | None:
-        """The run that began last, of those that are going on; None if there is none. Raises UsageError as `running`
-        does."""
-        return next(iter(SlotReader.running()), None)
+    def newest(pid: int | None = None) -> RunningSlot | None:
+        """The run that began last, of those that are going on; None if there is none. pid: of a run of this process
+        alone. Raises UsageError as `running` does."""
+        return next((slot for slot in SlotReader.running() if pid in (None, slot.pid)), None)
 
     @classmethod
     def open(cls, path: Path) -> Self:

@@ -70,7 +70,8 @@ def commands_section(runs: Sequence[RunFacts]) -> str:
         if run.recorded and run.number is not None:
             estimator = run.summary.get("estimator")
             with_it = f" --estimator {estimator}" if estimator else ""
-            lines.append(f"rig reconstruct {folder}{with_it} --out again   # the same maps from the same frames")
+            new = _quoted(run.folder.with_name(f"{run.folder.name}-again"))
+            lines.append(f"rig reconstruct {folder}{with_it} --out {new}   # the same maps from the same frames")
     lines.append(f"rig report {' '.join(_quoted(run.folder) for run in runs)}   # this page")
     return preformatted("\n".join(lines))
 

@@ -63,7 +63,7 @@ def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
     """
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
-        raise UsageError(f"{folder} {what}; name the folder that holds the runs, such as 'runs'")
+        raise UsageError(f"{folder} {what}; name the folder that holds the runs, such as . for this one")
     if request.verdict is not None and request.verdict not in VERDICTS:
         raise UsageError(f"`verdict` is {request.verdict!r}; write one of {', '.join(VERDICTS)}")
     since = None if request.since is None else since_when(request.since, datetime.now(UTC))

@@ -43,13 +43,14 @@ class LiveNews:
 
 
 class LiveSource:
-    """Follows the newest running scan.
+    """Follows the newest running scan. pid: only scans of this process are followed; None for those of any.
 
     slot: the run that was followed last; None before the first. state: that of this run. rays: (u, v) of its camera;
     None if it is not calibrated.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pid: int | None = None) -> None:
+        self._pid = pid
         self.state = LiveState.WAITING
         self.slot: RunningSlot | None = None
         self._reader: SlotReader | None = None
@@ -113,7 +114,7 @@ class LiveSource:
         if now_s - self._looked_s < LOOK_S:
             return
         self._looked_s = now_s
-        found = SlotReader.newest()
+        found = SlotReader.newest(self._pid)
         if found is None:
             return
         try:

@@ -42,6 +42,7 @@ _NICE: Final = 10
 _ASPECT: Final = 1.3
 """Width over height of the point cloud's part of the page, about."""
 _PICTURES: Final = ("depth", "counts", "confidence")
+_ENDED_ALONE: Final = "The scan has ended. This is its last map; this page shows no other scan."
 _NO_SCAN: Final = "No scan of yours is running on this computer. This page waits for one: rig scan"
 _STATES: Final = {
     LiveState.WAITING: _NO_SCAN,
@@ -67,9 +68,9 @@ def view(
     was asked for, or an option is out of range; DamagedRecordingError for a recording without maps that is damaged.
     """
     request = replace(request or ViewRequest(), **changes)
-    _require_sizes(request)
+    _require_possible(run, request)
     require_viser()
-    source = LiveSource() if run is None else RunSource(Path(run))
+    source = LiveSource(request.process) if run is None else RunSource(Path(run))
     with ExitStack() as stack:
         shows: _ShowsLive | _ShowsRun
         if isinstance(source, LiveSource):
@@ -85,8 +86,10 @@ def view(
             shows.serve()
 
 
-def _require_sizes(request: ViewRequest) -> None:
+def _require_possible(run: str | os.PathLike[str] | None, request: ViewRequest) -> None:
     problems = []
+    if request.process is not None and run is not None:
+        problems.append("`process` is for a running scan; leave it out")
     if not 1 <= request.view_points <= MOST_POINTS:
         problems.append(f"`view_points` is {request.view_points}; it must be at least 1 and at most {MOST_POINTS}")
     if not 0 < request.view_rate <= MOST_RATE_HZ:
@@ -333,7 +336,10 @@ class _ShowsLive(_Shows):
             self.tell_map()
         if self._source.state is not self._state:
             self._state = self._source.state
-            self.pages.tell("state", {"state": self._state.value, "text": _STATES[self._state]})
+            text = _STATES[self._state]
+            if self._state is LiveState.ENDED and self._asked.process is not None:
+                text = _ENDED_ALONE
+            self.pages.tell("state", {"state": self._state.value, "text": text})
 
     def _tell_fog(self, shown: ShownMap) -> None:
         reading = health.fog_of(shown.about.get("fog"))

@@ -49,6 +49,36 @@ def test_no_kernel_is_compiled_after_arming(tmp_path: Path) -> None:
     assert "late:" not in ran.stdout, ran.stdout
 
 
+SCAN_AND_TELL = """
+import sys
+from rig.kernel_cache import prepare_kernels
+prepare_kernels()
+from numba.core import event
+
+class Told(event.Listener):
+    def on_start(self, event):
+        print("compiled:", event.data["dispatcher"].py_func.__name__, flush=True)
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Told())
+from rig import api
+for estimator in sys.argv[2:]:
+    api.scan(sys.argv[1], maps=1, seed=1, estimator=estimator)
+"""
+
+
+def test_a_second_scan_compiles_nothing(tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig")
+    command = [sys.executable, "-c", SCAN_AND_TELL, str(rig), *ESTIMATORS]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    said = [
+        subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=True).stdout
+        for _ in range(2)
+    ]
+    assert "compiled:" not in said[1], said[1]
+
+
 def main(folder: Path) -> None:
     """Run the scans."""
     emulated = {**config(), **EMULATED, "scan": {**config()["scan"], **SCAN}}

@@ -125,7 +125,7 @@ def _cut(weight: Float32, units: int) -> Float32:
     return np.clip(np.rint(weight * np.float32(units)), -WEIGHT_LIMIT, WEIGHT_LIMIT)
 
 
-@numba.njit(inline="always")
+@numba.njit(inline="always", cache=True)  # called from Python too
 def first_px(odd, reach):  # type: ignore[no-untyped-def]
     """First pixel of the pairs that cover a pixel and `reach` on either side, relative to it. odd: its last bit."""
     return (odd - reach) // 2 * 2 - odd

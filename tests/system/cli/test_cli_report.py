@@ -26,7 +26,7 @@ def test_a_recorded_scan_has_a_page_beside_it_with_counts_of_five_rows(rig: Rig,
     assert html.count("<title>Counts, column") == html.count("<h3>Row ") == 5
     assert html.count("data:image/png") == 3
     assert f"rig scan --like {run}" in words
-    assert f"rig reconstruct {run} --estimator argmax --out again" in words
+    assert f"rig reconstruct {run} --estimator argmax --out {run}-again" in words
     # The run's own figures, as they are in its summary.
     summary = json.loads((run / "summary.json").read_text())
     assert f"{1e3 * summary['truth']['depth_error_m']['median_abs']:.3g}"[:3] in words

@@ -1,5 +1,6 @@
 """The page of a running scan in a real browser. The scan is played by the test, which writes the slot."""
 
+import os
 import subprocess
 import sys
 import time
@@ -190,6 +191,24 @@ def test_the_last_map_stays_when_the_scan_ends(live: Served, open_tab: Open) -> 
     assert tab.page.inner_text("#label") == "map 7"
     assert tab.page.is_disabled("#stop")
     tab.cloud()
+
+
+def test_a_page_of_one_process_never_shows_the_scan_of_another(slots: Path, open_tab: Open) -> None:
+    """Its button would stop that scan. `rig scan --view` and `rig demo` start such a page."""
+    with served("--live", "--process", os.getpid(), folder=slots) as viewer:
+        tab = open_tab(viewer.url)
+        with scanning("mine") as slot:
+            wait_for(tab, slot, "document.getElementById('title').textContent === 'mine'")
+        tab.until("latest.state.state === 'ended'")
+        assert "shows no other scan" in tab.page.inner_text("#state")
+        code = (
+            "import sys, time\nfrom tests.system.view.test_live_page import scanning\n"
+            "with scanning('of another process'):\n    print('begun', flush=True)\n    time.sleep(4)\n"
+        )
+        ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert "begun" in ran.stdout
+        assert tab.page.inner_text("#title") == "mine"
+        assert tab.tells("state")["state"] == "ended"
 
 
 def test_a_scan_whose_process_is_killed_is_told_apart_from_one_that_ended(live: Served, open_tab: Open) -> None:

@@ -43,7 +43,7 @@ def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, m
     page = start_page(stays=stays, port=port)
     try:
         with socket.create_connection(("127.0.0.1", port), 1):
-            assert program.read_text() == f"view --live --port {port}{more}"
+            assert program.read_text() == f"view --live --port {port} --process {os.getpid()}{more}"
         group = Path(f"/proc/{page.pid}/autogroup")
         assert not group.exists() or group.read_text().split()[-1] == str(NICE)
         assert os.getsid(page.pid) != os.getsid(0)
