@@ -389,7 +389,7 @@ class _ShowsRun(_Shows):
         }
         self.pages.tell("setup", told)
         self.pages.tell("state", {"state": "run", "text": ""})
-        self.pages.tell("health", {"figures": health.of_summary(source.summary, source.manifest)})
+        self._tell_health(source.summary)
         self._fog = {number: {"map": number, **(health.fog_of(fog) or {})} for number, fog in source.fog}
         self._tell_fog()
         self._select(source.numbers[-1])
@@ -448,6 +448,7 @@ class _ShowsRun(_Shows):
         self._estimated_again = False
         if before:
             self._tell_fog()
+            self._tell_health(self._source.summary)
         self._label = f"map {number}" if self._shown.stripe else f"counts of map {number}, which has no estimate"
         if not self._source.recorded and not self._shown.stripe:
             self._label = f"sum {number} of imported frames"
@@ -494,6 +495,7 @@ class _ShowsRun(_Shows):
                 if asked.number and not asked.by_cutting:
                     self._label += ", maps before it included"
                 self.tell_map()
+                self._tell_health(made.summary)
                 again = health.fog_of(made.summary.get("fog"))
                 self._tell_fog({asked.number: {"map": asked.number, **again}} if again else {})
         except RigError as error:
@@ -502,6 +504,10 @@ class _ShowsRun(_Shows):
             self._again.close()
             self._again = None
             self.pages.tell("estimate", {"busy": False, "text": ""})
+
+    def _tell_health(self, summary: Mapping[str, Any]) -> None:
+        """Tell the figures of a summary: of the run, or of a map that was estimated again."""
+        self.pages.tell("health", {"figures": health.of_summary(summary, self._source.manifest)})
 
     def _tell_fog(self, again: Mapping[int, dict[str, Any]] | None = None) -> None:
         """Tell the readings of all maps. again: of a map that was estimated again, in the place of the run's."""

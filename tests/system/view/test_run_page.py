@@ -178,6 +178,7 @@ def test_a_map_is_estimated_again_while_the_page_goes_on(shown: Served, open_tab
     tab.hover("depth", 12, 40)
     tab.until("!latest.estimate.busy && latest.map.again")
     assert "estimated again with edge" in tab.page.inner_text("#label")
+    tab.until("document.getElementById('health').innerText.includes('edge')")
     tab.page.click("#recorded")
     tab.until("!latest.map.again && latest.map.label === 'map 1'")
 
