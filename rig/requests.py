@@ -308,7 +308,7 @@ class ViewRequest(CheckedRequest):
     view_points: int = option(250_000, "most points of an update, at most 250000")
     view_rate: float = option(10.0, "most updates a second, at most 10")
     until_closed: bool = option(False, "end with the scan, once no page is open")
-    process: int | None = option(None, "with --live, show only scans of the process of this number", unset="any")
+    process: int | None = option(None, "number of the process whose scans alone are shown live", unset="any")
 
 
 @described
