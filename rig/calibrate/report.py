@@ -28,7 +28,7 @@ from calibration.verdict import Verdict
 from calibration.views import BoardPose, View
 from rig.report.calibration import WIDTH_PX, enlarged_mm, uncertainty_section
 from rig.report.charts import Panel, Series, chart_svg
-from rig.report.page import Rows, Section, page, paragraph, picture, table, verdict_box
+from rig.report.page import Rows, Section, page, paragraph, picture, scaled_picture, table, verdict_box
 from rig.run_folder.pictures import Picture, Scale
 
 Report = tuple[str, Sequence[Section]]
@@ -100,13 +100,13 @@ def view_colour(view: int) -> tuple[int, int, int]:
     return _COLOURS[view % len(_COLOURS)]
 
 
-def cells_picture(cells_m: Array) -> Picture:
-    """Draw deviations in m of a board's squares from their plane, (squares down, across): bright in front, NaN
-    black."""
+def cells_picture(cells_m: Array, caption: str) -> str:
+    """HTML of a picture of deviations in m of a board's squares from their plane, (squares down, across): bright in
+    front, NaN black."""
     large = enlarged_mm(cells_m)
     known = large[np.isfinite(large)]
     most = max(float(np.abs(known).max()), 1e-3) if known.size else 1.0
-    return Scale(-most, most, "mm", absent="no scan").picture(large)
+    return scaled_picture(large, Scale(-most, most, "mm", absent="not scanned"), caption)
 
 
 def _at(x: float, y: float, scale: float) -> tuple[int, int]:
@@ -202,7 +202,7 @@ def check_report(boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty |
     """Make the report on a check of a calibration."""
     sections = []
     for board in boards:
-        caption = "How far the board's squares lie off their plane, negative and bright: in front; black: not scanned."
+        caption = "How far the board's squares lie off their plane, negative and bright: in front."
         rows = [
             ("flatness", f"rms {mm(board.flatness_rms_m)}, expected {mm(board.expected_m)}; peak "
                          f"{mm(board.flatness_peak_m)}"),
@@ -210,7 +210,7 @@ def check_report(boards: Sequence[CheckedBoard], uncertainty: DepthUncertainty |
             ("scale", f"{board.scale:.5f}, sd {digits(board.scale_sd, 2)}"),
             ("depth", f"{board.distance_m:.3f} m"),
         ]  # fmt: skip
-        shown = picture(cells_picture(board.cells_m), caption)
+        shown = cells_picture(board.cells_m, caption)
         sections.append((f"View {board.name}", table(("", ""), rows) + shown))
     if uncertainty is not None:
         sections.append(uncertainty_section(uncertainty))
@@ -283,16 +283,22 @@ _BINS = 60
 _MOST_LISTED = 40
 
 
-def dark_rate_picture(pixels: PixelMap) -> NDArray[np.uint8]:
+def dark_rate_picture(pixels: PixelMap) -> Picture:
     """Dark rates as a picture with its scale: logarithmic, from a third of the ordinary rate upwards, in counts/s; dead
     pixels are black.
     """
+    rate, scale = _dark_rates(pixels)
+    return scale.picture(rate)
+
+
+def _dark_rates(pixels: PixelMap) -> tuple[NDArray[np.float64], Scale]:
+    """Dark rates in counts/s, NaN for dead pixels, and the scale to draw them with."""
     rate = np.nan_to_num(pixels.rate_per_s, nan=0.0).astype(np.float64)
     low = max(pixels.ordinary_per_s / 3, 1e-3)
     high = max(float(rate.max(initial=0.0)), 10 * low)
     if pixels.dead is not None:
         rate = np.where(pixels.dead, np.nan, rate)
-    return Scale(high, low, "/s", "inferno", absent="dead", log=True).picture(rate)
+    return rate, Scale(high, low, "/s", "inferno", absent="dead", log=True)
 
 
 def pixel_page(
@@ -306,12 +312,9 @@ def pixel_page(
     and what changed since (`drift`). Both are None without an older map."""
     middle = pixels.ordinary_per_s
     fastest = float(np.nanmax(pixels.rate_per_s))
-    caption = (
-        f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale; dead "
-        "pixels are black."
-    )
+    caption = f"Dark rate of each pixel, {digits(middle / 3)} to {digits(fastest)} counts/s on a logarithmic scale."
     sections = [
-        ("Dark rate", picture(dark_rate_picture(pixels), caption)),
+        ("Dark rate", scaled_picture(*_dark_rates(pixels), caption)),
         ("Distribution", rate_chart(pixels, None if against is None else against.pixels)),
     ]
     if drift is not None:

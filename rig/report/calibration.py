@@ -14,7 +14,7 @@ from calibration.depth_error import GROUPS, DepthUncertainty, depth_uncertainty
 from calibration.errors import digits, in_mm
 from calibration.model.rig_model import RigModel
 from rig.report.charts import INK, Panel, Series, legend, panel_svg
-from rig.report.page import Section, page, paragraph, picture, preformatted, side_by_side, table, verdict_box
+from rig.report.page import Section, page, paragraph, preformatted, scaled_picture, side_by_side, table, verdict_box
 from rig.run_folder.pictures import Scale, depth_limits
 
 DISTANCES_M: Final = (1.0, 2.0, 5.0, 10.0)
@@ -116,10 +116,10 @@ def uncertainty_section(uncertainty: DepthUncertainty) -> Section:
 
 def uncertainty_picture(uncertainty: DepthUncertainty) -> str:
     """HTML of a picture of the expected depth error: bright where it is large, black where no scan reaches."""
-    caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m; black: not reached by the scan."
+    caption = f"Standard deviation of the depth at {uncertainty.depth_m:g} m."
     large = enlarged_mm(uncertainty.sd_m)
     low, high = depth_limits(large) or (0.0, 1.0)
-    return picture(Scale(high, low, "mm", "inferno", absent="no scan").picture(large), caption)
+    return scaled_picture(large, Scale(high, low, "mm", "inferno", absent="not reached by the scan"), caption)
 
 
 def enlarged_mm(values_m: Array) -> NDArray[np.float32]:

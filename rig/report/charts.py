@@ -158,9 +158,9 @@ def chart_svg(
     return "\n".join([*parts, "</svg>\n"])
 
 
-def legend(series: Sequence[Series]) -> str:
-    """HTML of a legend of curves, for charts that stand beside each other."""
-    parts = []
+def legend(series: Sequence[Series], *, of: str = "") -> str:
+    """HTML of a legend of curves, for charts that stand beside each other. of: title of the charts it is for."""
+    parts = [f"<b>{escape(of)}:</b> "] if of else []
     for each in series:
         line = Series("", each.colour, ((0, 0), (1, 0)), dashed=each.dashed, line=each.line, marker=each.marker)
         drawn = _curve(Axis(0, 1, False, 4, 28), Axis(0, 1, False, 7, 6), line)

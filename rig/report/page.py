@@ -14,9 +14,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rig.report.charts import FAINT, INK
-from rig.run_folder.pictures import Picture, png_bytes
+from rig.run_folder.pictures import Picture, Scale, png_bytes
 
 _STYLE: Final = f"""
 :root {{ color-scheme: light }}
@@ -30,25 +31,30 @@ h3 {{ font-size: 1em; margin: 1em 0 0.2em }}
 .wide {{ overflow-x: auto; margin: 0.4em 0 }}
 table {{ border-collapse: collapse; font-size: 0.92em }}
 td, th {{ padding: 0.15em 1.1em 0.15em 0; text-align: left; vertical-align: top }}
-.many td, .many th {{ white-space: nowrap }}
+.many td {{ white-space: nowrap }} .many th {{ vertical-align: bottom }}
 tr + tr td {{ border-top: 1px solid #eef1f4 }}
-td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }}
+td.number, th.number {{ text-align: right; font-variant-numeric: tabular-nums }} td.number {{ white-space: nowrap }}
 .side {{ display: flex; flex-wrap: wrap; gap: 4px 20px; align-items: flex-start }}
 .side > * {{ min-width: 0; max-width: 100% }}
 .pictures {{ display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 4px 20px }}
 figure {{ margin: 0.4em 0; min-width: 0; max-width: 640px }}
 figcaption, .small {{ color: #5f6d7b; font-size: 0.88em }}
 img, svg {{ max-width: 100%; height: auto; display: block }}
-.legend span {{ display: inline-block; margin-right: 1.4em }}
+.scale {{ position: relative; margin: 4px 2.2em 0; padding-bottom: 1.6em; font-size: 0.85em; white-space: nowrap }}
+.scale img {{ width: 100%; height: 10px; image-rendering: pixelated }}
+.scale span {{ position: absolute; top: 11px; transform: translateX(-50%) }}
+.none {{ display: inline-block; width: 0.8em; height: 0.8em; background: #000; print-color-adjust: exact }}
+.legend {{ margin: 0.2em 0 }} .legend span {{ display: inline-block; margin-right: 1.4em }}
 .key {{ display: inline-block; vertical-align: -2px }}
 .side > svg {{ flex: 1 1 300px; min-width: 0; max-width: 400px }}
 pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 1.35; overflow-x: auto;
   white-space: pre-wrap; overflow-wrap: anywhere }}
-@media (max-width: 480px) {{ body {{ font-size: 16px; padding: 0.5em 12px 2em }} .pictures {{ display: block }} }}
+@media (max-width: 480px) {{ body {{ font-size: 16px; padding: 0.5em 12px 2em }} .pictures {{ display: block }}
+  td, th {{ padding-right: 0.7em }} .many {{ font-size: 0.78em }} .many :is(td, th) {{ padding-right: 0.5em }} }}
 @media print {{
-  body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3 {{ break-after: avoid }}
-  figure, img, svg, tr, .good, .bad {{ break-inside: avoid }} .wide {{ overflow: visible }}
-  tr:first-child {{ break-after: avoid }}
+  body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3, .legend {{ break-after: avoid }}
+  figure, img, svg, tr, .good, .bad, .short {{ break-inside: avoid }} .wide {{ overflow: visible }}
+  pre.long {{ columns: 2; font-size: 7pt }}
   .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
   .side figure {{ flex-basis: 45% }} .side > svg {{ flex-basis: 30% }}
 }}
@@ -58,7 +64,9 @@ GENERATOR: Final = "spadrig"
 MOST_BYTES: Final = 2_000_000
 """Largest size of a report."""
 MANY_COLUMNS: Final = 5
-"""Tables with so many columns scroll on a phone rather than break their lines."""
+"""Cells of tables with so many columns keep their lines, and the table scrolls where it is too wide."""
+_SHORT_ROWS: Final = 30
+"""A table or text with at most so many lines is not broken at the end of a sheet of paper."""
 PICTURE_PX: Final = (512, 400, 320, 240, 120)
 """Longest side of embedded pictures; the smaller ones are for reports that would otherwise be too large."""
 JPEG_QUALITY: Final = 82
@@ -108,27 +116,47 @@ def paragraph(text: str, *, small: bool = False) -> str:
 
 
 def preformatted(text: str) -> str:
-    """HTML that shows plain text with its line breaks, such as a command or a config. The text is escaped."""
-    return f"<pre>{escape(text)}</pre>"
+    """HTML that shows plain text with its line breaks, such as a command or a config. The text is escaped. On paper,
+    long texts are set small, in two columns."""
+    kind = ' class="long"' if text.count("\n") > _SHORT_ROWS else ""
+    return f"<pre{kind}>{escape(text)}</pre>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table. Columns of numbers (or dashes in their place) are aligned right; a wide table scrolls."""
+    """A table. Columns of numbers (or dashes in their place) are aligned right; a wide table scrolls.
+
+    On paper a short table stays on one sheet, and a long one repeats its head on each sheet.
+    """
     numbers = [bool(rows) and all(_NUMBER.fullmatch(row[i]) for row in rows) for i in range(len(head))]
 
     def cells(row: Sequence[str], tag: str) -> str:
         kinds = (' class="number"' if number else "" for number in numbers)
         return "".join(f"<{tag}{kind}>{escape(text)}</{tag}>" for kind, text in zip(kinds, row, strict=True))
 
-    top = f"<tr>{cells(head, 'th')}</tr>" if any(head) else ""
-    kind = ' class="many"' if len(head) >= MANY_COLUMNS else ""
+    top = f"<thead><tr>{cells(head, 'th')}</tr></thead>" if any(head) else ""
+    kinds = ["many"] * (len(head) >= MANY_COLUMNS) + ["short"] * (len(rows) <= _SHORT_ROWS)
+    kind = f' class="{" ".join(kinds)}"' if kinds else ""
     body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f'<div class="wide"><table{kind}>{top}{body}</table></div>'
+    return f'<div class="wide"><table{kind}>{top}<tbody>{body}</tbody></table></div>'
 
 
 def picture(pixels: Picture, caption: str) -> str:
     """Embed a picture as PNG, with a caption below it."""
     return _figure(png_bytes(pixels, small=True), "png", caption)
+
+
+def scaled_picture(values: NDArray[np.floating], scale: Scale, caption: str) -> str:
+    """Embed values (rows, width) as a picture in the colours of a scale, with the scale and a caption below it.
+
+    The labels of the scale are text of the page, so they can be read however small the picture is shown.
+    """
+    marks = "".join(
+        f'<span style="left:{100 * (share if scale.rising else 1 - share):.1f}%">{escape(text)}</span>'
+        for share, text in scale.marks()
+    )
+    bar = f'<div class="scale"><img alt="" src="{_embedded(png_bytes(scale.bar()), "png")}">{marks}</div>'
+    absent = f' <i class="none"></i> {escape(scale.absent)}'
+    return _figure(png_bytes(scale.colours(values), small=True), "png", caption, bar, absent)
 
 
 def photograph(pixels: Picture, caption: str, most_px: int) -> str:
@@ -140,10 +168,15 @@ def photograph(pixels: Picture, caption: str, most_px: int) -> str:
     return _figure(bytes(data), "jpeg", caption)
 
 
-def _figure(data: bytes, kind: str, caption: str) -> str:
-    source = base64.b64encode(data).decode()
+def _figure(data: bytes, kind: str, caption: str, below: str = "", behind: str = "") -> str:
+    """An embedded picture. below: HTML between it and its caption. behind: HTML behind the caption."""
     alt = escape(caption)
-    return f'<figure><img alt="{alt}" src="data:image/{kind};base64,{source}"><figcaption>{alt}</figcaption></figure>'
+    shown = f'<img alt="{alt}" src="{_embedded(data, kind)}">'
+    return f"<figure>{shown}{below}<figcaption>{alt}{behind}</figcaption></figure>"
+
+
+def _embedded(data: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def pictures(parts: Sequence[str]) -> str:

@@ -37,16 +37,17 @@ def row_profiles(runs: Sequence[RunFacts]) -> str:
     """HTML of the profiles of all shown rows of one or two runs; empty if there is nothing to show."""
     rows = next((run.rows for run in runs if run.rows), ())
     parts: list[str] = []
-    shown: dict[str, Series] = {}
+    shown: dict[str, dict[str, Series]] = {}  # by the kind of chart
     for row in rows:
         panels = [panel for panel in (_depth(runs, row), _light(runs, row)) if panel is not None]
         for run in runs:
             panels += _counts(run, row, f", {run.name}" if len(runs) > 1 else "")
-        for series in (series for panel in panels for series in panel.series if series.label):
-            shown.setdefault(series.label, series)
+        for panel in panels:
+            for series in panel.series:
+                shown.setdefault(panel.title.split(",")[0], {}).setdefault(series.label, series)
         if panels:
             parts.append(f"<h3>Row {row}</h3>{side_by_side([panel_svg(panel) for panel in panels])}")
-    return legend(list(shown.values())) + "".join(parts) if parts else ""
+    return "".join([*(legend(list(curves.values()), of=kind) for kind, curves in shown.items()), *parts])
 
 
 def _curve(runs: Sequence[RunFacts], run: RunFacts, what: str, colour: str, points: Sequence[Point]) -> Series:

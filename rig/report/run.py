@@ -15,8 +15,8 @@ from rig.report.page import (
     page,
     paragraph,
     photograph,
-    picture,
     pictures,
+    scaled_picture,
     table,
     verdict_box,
 )
@@ -25,7 +25,7 @@ from rig.report.run_errors import depth_errors_m, errors_section
 from rig.report.run_facts import RunFacts
 from rig.report.run_settings import calibration_section, commands_section, settings_section, versions_section
 from rig.run_folder.manifest import UNFINISHED, RunVerdict
-from rig.run_folder.pictures import SCALE_PX, Scale, confidence_picture, depth_limits, depth_picture
+from rig.run_folder.pictures import CONFIDENCE_SCALE, Scale, depth_limits, depth_scale, doubt
 from rig.simd import Float32
 
 _GOOD: Final = RunVerdict.COMPLETE.value
@@ -72,7 +72,7 @@ def _page(runs: Sequence[RunFacts], most_px: int) -> str:
         ("Figures", _figures(runs)),
         ("Error against the truth", errors_section(runs)),
         ("Fog", _fog(runs)),
-        ("Rows", row_profiles(runs)),
+        ("Row profiles", row_profiles(runs)),
         ("Time by stage", _stages(runs)),
         ("Gaps", _gaps(runs)),
         ("Calibration", calibration_section(runs)),
@@ -115,28 +115,24 @@ def _pictures(runs: Sequence[RunFacts], most_px: int) -> str:
     def depth(run: RunFacts, at: str) -> str:
         if run.depth_m is None:
             return ""
-        ends = "" if limits is None else f" from {limits[0]:.3g} m (bright) to {limits[1]:.3g} m (dark)"
-        return picture(depth_picture(_thinned(run.depth_m, most_px), limits), f"Depth, {at}{ends}; black: no depth.")
+        return scaled_picture(_thinned(run.depth_m, most_px), depth_scale(limits), f"Depth, {at}.")
 
     def confidence(run: RunFacts, at: str) -> str:
         if run.confidence is None:
             return ""
-        return picture(
-            confidence_picture(_thinned(run.confidence, most_px)), f"Confidence of each depth, {at}; bright: sure."
-        )
+        worth = doubt(_thinned(run.confidence, most_px))
+        return scaled_picture(worth, CONFIDENCE_SCALE, f"Confidence of each depth, {at}.")
 
     def counts(run: RunFacts, at: str) -> str:
         if run.counts is None:
             return ""
-        beside = np.pad(run.counts, ((0, 0), (0, SCALE_PX)), constant_values=255)  # as wide as those with a scale
-        return photograph(beside, f"Counts, {at}, with local contrast.", most_px + SCALE_PX)
+        return photograph(run.counts, f"Counts, {at}, with local contrast.", most_px)
 
     def error(run: RunFacts, at: str) -> str:
         if (error_m := depth_errors_m(run)) is None:
             return ""
-        scale = Scale(_ERROR_M[1] * 1e3, _ERROR_M[0] * 1e3, "mm", "inferno", "unknown", log=True, steps=_COARSE)
-        drawn = scale.picture(_thinned(np.abs(error_m), most_px) * np.float32(1e3))
-        return picture(drawn, f"Error of the depth, {at}, from 1 mm (dark) to 1 m (bright); black: not known.")
+        scale = Scale(_ERROR_M[1] * 1e3, _ERROR_M[0] * 1e3, "mm", "inferno", "not known", log=True, steps=_COARSE)
+        return scaled_picture(_thinned(np.abs(error_m), most_px) * np.float32(1e3), scale, f"Error of the depth, {at}.")
 
     shown = []
     for what, kind in {"depth": depth, "confidence": confidence, "counts": counts, "error": error}.items():
@@ -161,14 +157,12 @@ def _difference(first: RunFacts, second: RunFacts, most_px: int) -> str:
     if not known.size:
         return ""
     most = max(1e3 * float(np.percentile(np.abs(known), 95)), 0.1)
-    drawn = Scale(-most, most, "mm", absent="not both", steps=_COARSE).picture(
-        _thinned(off_m, most_px) * np.float32(1e3)
-    )
+    scale = Scale(-most, most, "mm", absent="no depth in one of them", steps=_COARSE)
     said = (
         f"Depth of {second.name} minus that of {first.name}; bright: nearer, dark: farther. Median "
         f"{mm(float(np.median(known)))}, half of the pixels differ by less than {mm(float(np.median(np.abs(known))))}."
     )
-    return picture(drawn, said)
+    return scaled_picture(_thinned(off_m, most_px) * np.float32(1e3), scale, said)
 
 
 def _thinned(values: Float32, most_px: int) -> Float32:

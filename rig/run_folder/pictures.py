@@ -93,11 +93,31 @@ class Scale:
         picture[top:bottom, left : left + _BAR_PX] = _palette(self.palette)[
             1 + np.round(254 * shares).astype(int), None
         ]
-        for value, text in self.labels or self._round_labels(rows):
-            y = top + round((1 - float(self._share(np.array(value)))) * (bottom - top - 1))
+        for share, text in self.marks(min(_LABELS, max(1, rows // 40))):
+            y = top + round((1 - share) * (bottom - top - 1))
             cv2.line(picture, (left + _BAR_PX, y), (left + _BAR_PX + 3, y), _INK, 1)
             write(text, y)
         return picture
+
+    def bar(self) -> Picture:
+        """All colours of the scale in one line, from the smaller of the values at its ends to the larger one: RGB (1,
+        255, 3)."""
+        shares = np.linspace(0, 1, 255) if self.rising else np.linspace(1, 0, 255)
+        low, high = (math.log(end) if self.log else end for end in (self.dark, self.bright))
+        values = low + shares * (high - low)
+        return self.colours(np.exp(values) if self.log else values)[None]
+
+    @property
+    def rising(self) -> bool:
+        """Whether larger values are brighter."""
+        return self.bright > self.dark
+
+    def marks(self, most: int = _LABELS) -> list[tuple[float, str]]:
+        """Labels of the scale: the place of each, from 0 at `dark` to 1 at `bright`, and its text.
+
+        most: greatest number of labels on a linear scale without labels of its own.
+        """
+        return [(float(self._share(np.array(value))), text) for value, text in self.labels or self._round_labels(most)]
 
     def _share(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """Place of values on the scale, 0 at `dark` and 1 at `bright`."""
@@ -106,13 +126,12 @@ class Scale:
             return np.asarray(np.log(np.maximum(values, np.float32(1e-30)) / self.dark) * per_e)
         return np.asarray((values - self.dark) / (self.bright - self.dark))
 
-    def _round_labels(self, rows: int) -> list[tuple[float, str]]:
+    def _round_labels(self, most: int) -> list[tuple[float, str]]:
         low, high = sorted((self.bright, self.dark))
         if self.log:
             powers = range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)
             return [(10.0**power, f"{10.0**power:g} {self.unit}".rstrip()) for power in powers]
-        return [(value, f"{value:.4g} {self.unit}".rstrip()) for value in
-                round_values(low, high, min(_LABELS, max(1, rows // 40)))]  # fmt: skip
+        return [(value, f"{value:.4g} {self.unit}".rstrip()) for value in round_values(low, high, most)]
 
 
 @cache

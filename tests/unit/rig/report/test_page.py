@@ -17,9 +17,11 @@ from rig.report.page import (
     picture,
     pictures,
     preformatted,
+    scaled_picture,
     table,
     verdict_box,
 )
+from rig.run_folder.pictures import Scale
 from tests.unit.rig.report.pages import words_of
 
 NASTY = '<script>"&'
@@ -54,8 +56,8 @@ def test_columns_of_numbers_are_aligned_right_and_wide_tables_keep_their_lines()
     assert html.count('<td class="number">') == 4
     assert '<th class="number">value</th>' in html
     assert html.startswith('<div class="wide">')
-    assert 'class="many"' not in html
-    assert 'class="many"' in table(["x"] * 6, [["1"] * 6])
+    assert "many" not in html
+    assert 'class="many short"' in table(["x"] * 6, [["1"] * 6])
 
 
 def embedded(html, kind):
@@ -73,6 +75,30 @@ def test_pictures_are_embedded_as_they_are_and_photographs_made_smaller():
     assert small.shape == (200, 300)
     assert abs(int(small.mean()) - 120) <= 2
     assert embedded(photograph(grey[:50, :60], "counts", 300), "jpeg").shape == (50, 60)
+
+
+@pytest.mark.parametrize(("bright", "dark"), [(1.0, 3.0), (3.0, 1.0)])
+def test_the_scale_of_a_picture_is_text_of_the_page_and_begins_with_the_smallest_value(bright, dark):
+    scale = Scale(bright, dark, "m", absent="<none>")
+    values = np.linspace(1, 3, 200, dtype=np.float32).reshape(10, 20)
+    html = scaled_picture(values, scale, "a caption")
+    np.testing.assert_array_equal(embedded(html, "png")[..., ::-1], scale.colours(values))
+    drawn = [embedded(each, "png") for each in html.split("<img ")[1:]]
+    assert drawn[1].shape == (1, 255, 3)
+    np.testing.assert_array_equal(drawn[1][0, [0, -1], ::-1], scale.colours(np.array([1.0, 3.0])))
+    marks = {text: float(at) for at, text in re.findall(r'left:([\d.]+)%">([^<]*)<', html)}
+    assert marks == {"1 m": 0, "1.5 m": 25, "2 m": 50, "2.5 m": 75, "3 m": 100}
+    assert "&lt;none&gt;" in html
+
+
+def test_on_paper_short_tables_stay_whole_and_long_ones_repeat_their_head():
+    assert 'class="short"' in table(["x"], [["1"]] * 5)
+    long = table(["x"], [["1"]] * 100)
+    assert "short" not in long
+    assert long.index("<thead>") < long.index("</thead>") < long.index("<tbody>")
+    assert "<thead>" not in table(["", ""], [["a", "1"]])
+    assert 'class="long"' in preformatted("line\n" * 100)
+    assert "class" not in preformatted("a command")
 
 
 def test_a_report_is_recognised(tmp_path):
