@@ -6,6 +6,8 @@ for each, so that nobody has to correct a config one key at a time. Errors of a 
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
 from typing import ClassVar, TypeVar
 
 Item = TypeVar("Item")
@@ -52,6 +54,20 @@ def each_or_problems(items: Iterable[Item], make: Callable[[Item], Made]) -> lis
     if problems:
         raise UsageError.of(problems)
     return made
+
+
+def absent(path: Path, step: str, among: Callable[[Path], bool] = lambda _: True) -> str:
+    """Say that a path does not exist, which path beside it has a similar name, and what to do: `step`.
+
+    among: whether a path beside it is of the right kind.
+    """
+    try:
+        beside = [each.name for each in path.parent.iterdir() if not each.name.startswith(".") and among(each)]
+    except OSError:
+        beside = []
+    close = get_close_matches(path.name, beside, n=1)
+    meant = f"did you mean '{path.with_name(close[0])}'? " if close else ""
+    return f"{path} does not exist; {meant}{step}"
 
 
 class PlanError(UsageError):

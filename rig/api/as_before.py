@@ -10,7 +10,7 @@ from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from rig.config.files import parse_config
 from rig.config.models import RigConfig
 from rig.config.overrides import PathLike
-from rig.errors import UsageError
+from rig.errors import UsageError, absent
 from rig.requests import ScanRequest
 from rig.run_folder.manifest import MANIFEST, read_manifest
 
@@ -35,8 +35,10 @@ def repeat(run: PathLike) -> tuple[RigConfig, ScanRequest]:
     folder = Path(run)
     manifest = read_manifest(folder)
     if manifest is None:
-        lacks = f"has no {MANIFEST}" if folder.exists() else "does not exist"
-        raise UsageError(f"{folder} {lacks}; name the folder of a scan, 'rig runs' lists them")
+        step = "name the folder of a scan, 'rig runs' lists them"
+        if not folder.exists():
+            raise UsageError(absent(folder, step, Path.is_dir))
+        raise UsageError(f"{folder} has no {MANIFEST}; {step}")
     if manifest.get("command") != "scan" or not manifest.get("config"):
         what = manifest.get("command") or "unknown command"
         raise UsageError(f"{folder} is the run of a {what}, which has no rig to scan with; name the run of a scan")

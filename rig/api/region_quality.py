@@ -9,7 +9,7 @@ import numpy as np
 
 from rig.config.overrides import PathLike
 from rig.depth.quality import RegionQuality, RegionTally
-from rig.errors import DamagedRecordingError, UsageError
+from rig.errors import DamagedRecordingError, UsageError, absent
 from rig.progress import tell_stage
 from rig.run_folder.map_files import read_depth
 from rig.run_folder.pictures import ply_points
@@ -45,8 +45,10 @@ def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQ
     folder = Path(run)
     files = sorted((folder / "depth").glob("*.npy"))
     if not files:
-        why = "holds no depth maps (depth/*.npy)" if folder.is_dir() else "does not exist"
-        raise UsageError(f"{folder} {why}; name the folder of a calibrated run, or make maps with 'rig reconstruct'")
+        step = "name the folder of a calibrated run, or make maps with 'rig reconstruct'"
+        if not folder.exists():
+            raise UsageError(absent(folder, step, Path.is_dir))
+        raise UsageError(f"{folder} holds no depth maps (depth/*.npy); {step}")
     given = None if region is None else Region.parse(region if isinstance(region, str) else ",".join(map(str, region)))
     tally: RegionTally | None = None
     for done, file in enumerate(files):

@@ -11,7 +11,7 @@ from typing import Final
 from calibration.errors import CalibrationError
 from calibration.files.rig_file import CALIBRATION_FILE, load_rig_model
 from rig.config.overrides import PathLike
-from rig.errors import UsageError
+from rig.errors import UsageError, absent
 from rig.report.calibration import calibration_report
 from rig.report.page import is_report
 from rig.report.run import run_report
@@ -78,7 +78,7 @@ def report(
 
 def _kind(path: Path) -> str:
     if not path.exists():
-        raise UsageError(f"{path} does not exist; {_WHAT}")
+        raise UsageError(absent(path, _WHAT))
     if path.is_dir():
         if is_run(path):
             return "run"

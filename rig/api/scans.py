@@ -18,7 +18,7 @@ from rig.config.overrides import SIMULATED, Config, PathLike, configure, seed_pr
 from rig.devices.calibration_use import calibration_use, cube_calibration_use
 from rig.devices.open import OpenRig, light_problems, open_rig
 from rig.devices.prepare import prepare, require_memory
-from rig.errors import UsageError, noted
+from rig.errors import UsageError, absent, noted
 from rig.estimate.registry import estimate_problems
 from rig.live.feed import Feed
 from rig.live.record_wish import followed
@@ -288,8 +288,7 @@ def reconstruct(
         return replay(source, clock="max", calibration=calibration, progress=progress, **asked)
     if plan is None or calibration is None:
         if not source.exists():
-            said = "does not exist; name the folder of a run taken with `record`, or an .npy of frames"
-            raise UsageError(f"{source} {said}")
+            raise UsageError(absent(source, "name the folder of a run taken with `record`, or an .npy of frames"))
         missing = [name for name, given in (("`plan`", plan), ("`calibration`", calibration)) if given is None]
         raise UsageError(f"{source} holds frames alone; add {' and '.join(missing)} to say how they were taken")
     estimate = _estimate(request)

@@ -183,17 +183,22 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
     command = context.command_path if context is not None else "rig"
     message = error.format_message().rstrip(".")
     # The wording about the type of an option differs between versions, but these words are in all of them.
-    steps = (
-        ("valid integer", "write a whole number or "),
-        ("valid float", "write a number or "),
-        ("valid number", "write a number or "),
-    )
-    wanted = next((step for words, step in steps if words in message), "")
-    names = getattr(getattr(error, "param", None), "opts", ())
+    kinds = {"valid integer": "whole number", "valid float": "number", "valid number": "number"}
+    wanted = next((kind for words, kind in kinds.items() if words in message), None)
+    names: Sequence[str] = getattr(getattr(error, "param", None), "opts", ())
     given = [value for name in names for value in _values(name, arguments)]
-    if given and not any(value in message for value in given):
+    if given and wanted is not None:
+        message = f"{names[0]} is {given[-1]!r}, which is no {wanted}"
+    elif given and not any(value in message for value in given):
         message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
-    return fail(EXIT_USAGE, [f"{message}; {wanted}see '{command} --help'"], [], as_json)
+    meant = ""
+    if hasattr(error, "possibilities"):  # an option that does not exist
+        unknown = str(getattr(error, "option_name", ""))
+        similar = list(error.possibilities or ())
+        best = [name for name in similar if name.startswith(unknown)] or similar
+        meant = f"did you mean {best[0]}? " if best else ""
+        message = f"there is no option {unknown}"
+    return fail(EXIT_USAGE, [f"{message}; {meant}see '{command} --help'"], [], as_json)
 
 
 def _values(option: str, arguments: list[str]) -> list[str]:

@@ -257,7 +257,7 @@ _RUNS: Columns[RunEntry] = (
     ("config", lambda run: run.config or "-"),
     ("scene", lambda run: PurePath(run.scene).name or "-"),
     ("estimator", lambda run: run.estimator or "-"),
-    ("K", lambda run: "-" if run.exposures is None else str(run.exposures)),
+    ("exposures", lambda run: "-" if run.exposures is None else str(run.exposures)),
     ("size", lambda run: ("rec " if run.recorded else "") + _size(run.bytes)),
     ("tags", lambda run: ", ".join(run.tags)),
     ("note", lambda run: run.problem or _one_line(run.note)),
@@ -274,11 +274,11 @@ def runs_table(runs: Sequence[RunEntry], without: str) -> None:
     if not runs:
         tell(without)
         return
-    numbers = ("maps", "K", "size")
+    numbers = ("maps", "exposures", "size")
     console(WIDE).print(_table(_RUNS, runs, left=[name for name, _ in _RUNS if name not in numbers], apart=2))
     damaged = sum(run.verdict == DAMAGED for run in runs)
     size = _size(sum(run.bytes for run in runs))
-    tell(f"{len(runs)} runs, {size}" + (f", {damaged} damaged" if damaged else ""))
+    tell(f"{len(runs)} run{'s' * (len(runs) != 1)}, {size}" + (f", {damaged} damaged" if damaged else ""))
 
 
 def _size(count: int) -> str:

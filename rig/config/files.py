@@ -179,14 +179,18 @@ def find_config(name_or_path: str | Path) -> Path:
         return BUNDLED / f"{path.name}.yaml"
     if os.path.isdir(path):
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
-    close = difflib.get_close_matches(path.stem, names, n=1)
+    try:
+        beside = [str(one) for one in path.parent.iterdir() if one.suffix in SUFFIXES]
+    except OSError:
+        beside = []
+    close = difflib.get_close_matches(path.stem, names, n=1) or difflib.get_close_matches(str(path), beside, n=1)
     meant = f"did you mean '{close[0]}'? " if close else ""
     if path.name in (one.name for one in bundled_scenes()):
         meant = f"it is a scene, which is chosen by `scene={path.name}`; "
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
         f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
-        "anything else is the path of a YAML file"
+        "anything else is the path of a YAML file, as 'rig config show NAME > FILE' makes one"
     )
 
 

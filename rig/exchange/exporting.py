@@ -11,7 +11,7 @@ from drivers.frames import FrameBlock
 from drivers.recorded import RunRecording
 from drivers.recorded.segments import segment_files
 from rig.config.overrides import PathLike
-from rig.errors import DamagedRecordingError, UsageError
+from rig.errors import DamagedRecordingError, UsageError, absent
 from rig.exchange import hdf5, pictures
 from rig.exchange.npy import FrameLog, MapFiles, write_npy
 from rig.exchange.pictures import VIEWS, View
@@ -194,7 +194,7 @@ def _check(run: Path, kind: str, request: ExportRequest) -> None:
     no_film = known and kind != "mp4"
     checks = [
         (not known, f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}"),
-        (not run.exists(), f"{run} does not exist; name the folder of a run"),
+        (not run.exists(), absent(run, "name the folder of a run", Path.is_dir)),
         (view not in (None, *VIEWS), f"view {view!r} is unknown; choose one of {', '.join(VIEWS)}"),
         (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
         (summed is not None and no_pictures, f"`frames_per_picture={summed}` are summed for pictures, {no_pictures}"),

@@ -1,6 +1,5 @@
 """Opens recordings for the commands that read one, and finds what they hold and which frames belong to which map."""
 
-import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +16,7 @@ from drivers.recorded.contents import INDEX_FILE
 from drivers.recorded.segments import PACKED_SUFFIX, segment_files, zstandard_or_error
 from rig.config.overrides import PathLike
 from rig.count.bind import MAX_RESIDUAL_COLUMNS
-from rig.errors import DamagedRecordingError, UsageError
+from rig.errors import DamagedRecordingError, UsageError, absent
 from rig.plan.scan_plan import MAX_CLOCK_ERROR
 from rig.progress import tell_stage
 from rig.run_folder.manifest import MANIFEST, RunGap, ended_before_last_map, is_cut_short, known_missing, read_manifest
@@ -45,7 +44,10 @@ def require_recording(path: Path, wanted: str = "a run taken with `record`") -> 
     """
     files = segment_files(path).values() if path.is_dir() else ()
     if not files:
-        raise UsageError(f"{path} {_instead(path, f'name the folder of {wanted}')}")
+        name_one = f"name the folder of {wanted}"
+        if not path.exists():
+            raise UsageError(absent(path, name_one, lambda one: one.is_dir() and bool(segment_files(one))))
+        raise UsageError(f"{path} {_instead(path, name_one)}")
     if any(file.name.endswith(PACKED_SUFFIX) for file in files):
         try:
             zstandard_or_error()
@@ -57,11 +59,6 @@ def _instead(path: Path, name_one: str) -> str:
     """Say what a path without a recording is, and what to do next."""
     if path.is_file():
         return "is a file; " + ("name the folder that it lies in" if path.match(f"{SEGMENTS}*") else name_one)
-    if not path.exists():
-        beside = [one.name for one in path.parent.glob("*/") if segment_files(one)]
-        close = difflib.get_close_matches(path.name, beside, n=1)
-        meant = f"did you mean '{path.with_name(close[0])}'? " if close else ""
-        return f"does not exist; {meant}{name_one}"
     inside = sorted(part for part in path.iterdir() if part.is_dir() and segment_files(part))
     if inside:
         more = "" if len(inside) == 1 else f" or another of {len(inside)} in it"

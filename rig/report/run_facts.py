@@ -97,7 +97,9 @@ def read_run(folder: Path, number: int | None = None) -> RunFacts:
     counted = _counted_maps(folder, reader) if recorded else None
     there = sorted({*numbers, *(counted.maps if counted is not None else ())})
     if number is not None and number not in there:
-        has = f"it has {there[0]} to {there[-1]}" if there else "it has none"
+        has = f"it has maps {there[0]} to {there[-1]}, so name one of these" if there else "it has no map"
+        if len(there) == 1:
+            has = f"its only map is {there[0]}"
         raise UsageError(f"map {number} is not in {folder}; {has}")
     shown = number if number is not None else (numbers or there or (None,))[-1]
     facts: dict[str, Any] = {"numbers": tuple(there), "number": shown}

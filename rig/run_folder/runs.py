@@ -57,7 +57,7 @@ class RunEntry:
 
 def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
     """The runs in a folder and up to MOST_DEPTH levels below it, the oldest first, that pass all filters of the
-    request.
+    request. Maps that were made later of the same frames follow their scan.
 
     Raises UsageError if there is no such folder, or for a filter that cannot be read.
     """
@@ -68,8 +68,9 @@ def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
         raise UsageError(f"`verdict` is {request.verdict!r}; write one of {', '.join(VERDICTS)}")
     since = None if request.since is None else since_when(request.since, datetime.now(UTC))
     entries = [_entry(run) for run in _runs_below(folder, MOST_DEPTH)]
-    kept = [entry for entry in entries if _passes(entry, request, since)]
-    return sorted(kept, key=lambda entry: (entry.taken, entry.folder))
+    kept = [(entry, newest) for entry, newest in entries if _passes(entry, request, since)]
+    # Maps made later of the same frames follow the scan, which has the same time.
+    return [entry for entry, _ in sorted(kept, key=lambda each: (each[0].taken, each[1], each[0].folder))]
 
 
 def since_when(text: str, now: datetime) -> datetime:
@@ -129,7 +130,8 @@ def is_run(folder: Path) -> bool:
     )
 
 
-def _entry(folder: Path) -> RunEntry:
+def _entry(folder: Path) -> tuple[RunEntry, datetime]:
+    """What a list says of a run, and the time of its newest file."""
     manifest: Mapping[str, Any] = {}
     summary: Mapping[str, Any] = {}
     problem = ""
@@ -141,7 +143,7 @@ def _entry(folder: Path) -> RunEntry:
         problem = str(error).partition(";")[0]
     size, newest = _size_and_time(folder)
     config = manifest.get("config") or {}
-    return RunEntry(
+    entry = RunEntry(
         folder=folder,
         taken=_taken(manifest) or newest,
         verdict=DAMAGED if problem else str(manifest.get("verdict") or DAMAGED),
@@ -157,6 +159,7 @@ def _entry(folder: Path) -> RunEntry:
         bytes=size,
         problem=problem,
     )
+    return entry, newest
 
 
 def read_summary(folder: Path) -> Mapping[str, Any]:

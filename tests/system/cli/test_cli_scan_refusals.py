@@ -58,8 +58,10 @@ def test_a_bad_config_is_refused_in_a_line_and_nothing_is_left(
     [
         (["--on-overload", "ignore"], "write 'abort', 'drop' or 'block'"),
         (["--exposures", "-1"], "--exposures is -1, it must be at least 1; write for example --exposures 10"),
-        (["--exposures", "many"], "write a whole number or see 'rig scan --help'"),
-        (["--min-confidence", "high"], "write a number or see 'rig scan --help'"),
+        (["--exposures", "many"], "--exposures is 'many', which is no whole number; see 'rig scan --help'"),
+        (["--min-confidence", "high"], "--min-confidence is 'high', which is no number; see 'rig scan --help'"),
+        (["--exposure", "20"], "there is no option --exposure; did you mean --exposures? see 'rig scan --help'"),
+        (["--zzz"], "there is no option --zzz; see 'rig scan --help'"),
         (["--maps", "0"], "maps is 0; it must be at least 1"),
         (["--seed", "-3"], "seed is -3; it must be 0 or more"),
         (["--seed", str(2**63)], "at most 2^63 - 1"),

@@ -80,6 +80,14 @@ def test_a_run_is_listed_if_it_passes_every_filter(runs: Path, filters: dict[str
     assert names(runs, **filters) == passing
 
 
+def test_maps_made_later_of_the_same_frames_follow_their_scan(tmp_path: Path) -> None:
+    for name, written_s in (("scan", 1000), ("again", 2000), ("a-first", 3000)):
+        folder = make(tmp_path / name, "2025-11-29T10:00:00+00:00")
+        for file in folder.iterdir():
+            os.utime(file, (written_s, written_s))
+    assert names(tmp_path) == ["scan", "again", "a-first"]
+
+
 def test_a_damaged_run_is_listed_with_the_reason_and_hides_no_other(runs: Path) -> None:
     manifest = runs / "late" / "manifest.json"
     manifest.write_text(manifest.read_text().replace("LIGHT", "NIGHT"))

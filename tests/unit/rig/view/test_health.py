@@ -64,7 +64,7 @@ def test_a_summary_is_told_with_its_verdict_and_doubts() -> None:
     assert said["doubt"] == "no light (maps 0, 3)"
     assert said["frames"] == "12\u202f345 of 12\u202f346"
     assert said["lost"] == "1 frames, 1 gaps in whole maps"
-    assert said["maps"] == "4, 17.3 a second"
+    assert said["maps"] == "4, 17.3 a second of sensor time"
     assert said["disk"] == "2.5 MB recorded"
     found = levels(of_summary(summary, manifest))
     assert (found["verdict"], found["doubt"], found["lost"]) == (BAD, BAD, BAD)
