@@ -1,4 +1,4 @@
-"""The call that makes one page of a run, of two runs side by side, a calibration, a trade-off or a study: `report`.
+"""The call that makes one page of a run, of two runs, a calibration, a trade-off, a comparison or a study: `report`.
 
 Most reports are of runs, and somebody waits for them. So modules that only other reports need are imported late.
 """
@@ -20,13 +20,13 @@ from rig.run_folder.disk import replace_file
 from rig.run_folder.runs import is_run
 
 STUDY_FILE: Final = "study.json"
-_WHAT: Final = "name the folder of a run, a calibration, a trade-off or a study, or a calibration.yaml"
+_WHAT: Final = "name the folder of a run, a calibration, a trade-off, a comparison or a study, or a calibration.yaml"
 
 
 @dataclass(frozen=True, slots=True)
 class ReportResult:
-    """A written report. kind: run, runs, calibration, tradeoff or study. missing: sentences on what the shown runs
-    lack."""
+    """A written report. kind: run, runs, calibration, tradeoff, comparison or study. missing: sentences on what the
+    shown runs lack."""
 
     file: Path
     kind: str
@@ -38,15 +38,15 @@ def report(
     run: PathLike, other: PathLike | None = None, *, out: PathLike | None = None, map: int | None = None
 ) -> ReportResult:
     """Write one HTML page, which needs no other file: on a run or recording, on two of them side by side, on a
-    calibration, a trade-off or a study (`rig report`).
+    calibration, a trade-off, a comparison of strategies, or a study (`rig report`).
 
     run: the folder; for a calibration also its file.
     other: a second run.
     out: the file to write; None: NAME-report.html beside the folder or file. An older report is replaced.
     map: number of the map that is shown; None: the last one.
 
-    The page names whatever is missing in a run. Raises UsageError for anything other than a run, a calibration, a
-    trade-off or a study, for a map that does not exist, and if `out` cannot be written or exists and is no report.
+    The page names whatever is missing in a run. Raises UsageError for any other folder or file, for a map that does not
+    exist, and if `out` cannot be written or exists and is no report.
     """
     folder, second = Path(run), None if other is None else Path(other)
     kind = _kind(folder)
@@ -67,6 +67,10 @@ def report(
         from rig.study.tables import study_report
 
         text = study_report(folder)
+    elif kind == "comparison":
+        from rig.strategies.comparison.files import comparison_report
+
+        text = comparison_report(folder)
     else:
         from rig.tradeoff.files import tradeoff_report
 
@@ -90,7 +94,11 @@ def _kind(path: Path) -> str:
 
         if (path / TRADEOFF_FILE).exists():
             return "tradeoff"
-        raise UsageError(f"{path} holds no run, no calibration, no trade-off and no study; {_WHAT}")
+        from rig.strategies.comparison.files import COMPARISON_FILE
+
+        if (path / COMPARISON_FILE).exists():
+            return "comparison"
+        raise UsageError(f"{path} holds no run, no calibration, no trade-off, no comparison and no study; {_WHAT}")
     if path.suffix in (".yaml", ".yml"):
         return "calibration"
     raise UsageError(f"{path} is a file; {_WHAT}")

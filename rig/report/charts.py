@@ -4,6 +4,7 @@ Pictures in the repository are SVG (docs/decisions/0008-pictures-are-svg.md); a 
 """
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -18,6 +19,8 @@ PANEL_PX = (400, 290)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 30, 46
 _LEGEND_PX = 20
 _TITLE_PX = 30
+_NOTE_PX = 6
+"""Width of a letter of small print, rather too much, by which its lines are broken."""
 _DECADES_WITH_STEPS = 2.3
 """Axes over fewer decades than this are labelled at 1, 2 and 5 times their powers of ten."""
 
@@ -124,8 +127,7 @@ def chart_svg(
     notes: Sequence[str] = (),
     panel_px: tuple[int, int] = PANEL_PX,
 ) -> str:
-    """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, lines of small print,
-    below.
+    """The text of an SVG file: panels in rows of up to `across`, with a legend and `notes`, small print, below.
 
     panel_px: width and height of the place for each panel; a `Panel` itself is always drawn in PANEL_PX.
     """
@@ -136,7 +138,8 @@ def chart_svg(
     in_row = max(1, width // 190)
     legend_top = _TITLE_PX + down * panel_height
     notes_top = legend_top + -(-len(entries) // in_row) * _LEGEND_PX + 8
-    height = notes_top + 15 * len(notes) + 8
+    lines = [line for note in notes for line in textwrap.wrap(note, width // _NOTE_PX)]
+    height = notes_top + 15 * len(lines) + 8
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
         'font-family="Helvetica, Arial, sans-serif" font-size="12">',
@@ -153,8 +156,8 @@ def chart_svg(
                       marker=series.marker)  # fmt: skip
         short = _curve(Axis(0, 1, False, left, left + 26), Axis(0, 1, False, top, top - 1), line)
         parts.append(f'{short}<text x="{left + 34}" y="{top + 4}" fill="{INK}">{escape(series.label)}</text>')
-    for i, note in enumerate(notes):
-        parts.append(f'<text x="20" y="{notes_top + 15 * i + 8}" font-size="11" fill="{FAINT}">{escape(note)}</text>')
+    for i, words in enumerate(lines):
+        parts.append(f'<text x="20" y="{notes_top + 15 * i + 8}" font-size="11" fill="{FAINT}">{escape(words)}</text>')
     return "\n".join([*parts, "</svg>\n"])
 
 

@@ -45,7 +45,9 @@ def of_summary(summary: Mapping[str, Any], manifest: Mapping[str, Any]) -> list[
         figures.append(_lost(lost, gaps))
     if summary.get("maps") is not None:
         rate = summary.get("map_rate_hz")
-        figures.append(Figure("maps", _whole(summary["maps"]) + ("" if rate is None else f", {rate:.3g} a second of sensor time")))
+        figures.append(
+            Figure("maps", _whole(summary["maps"]) + ("" if rate is None else f", {rate:.3g} a second of sensor time"))
+        )
     if summary.get("valid_fraction") is not None:
         figures.append(Figure("filled", f"{summary['valid_fraction']:.1%} of the pixels"))
     if stages := summary.get("stages"):

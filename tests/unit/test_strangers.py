@@ -32,6 +32,7 @@ from rig.run_folder.manifest import MANIFEST, file_crc32, read_manifest, sealed_
 from rig.run_folder.map_files import map_numbers, read_arrays, read_depth
 from rig.run_folder.pictures import png_bytes, read_grey
 from rig.run_folder.runs import DAMAGED, list_runs
+from rig.strategies.comparison.files import COMPARISON_FILE, comparison_report
 from rig.study.definition import load_study
 from rig.tradeoff.files import TRADEOFF_FILE, tradeoff_report
 from rig.view.access import Access, Asked
@@ -125,6 +126,35 @@ def test_a_trade_off_with_other_content_is_refused(tmp_path: Path, change: dict[
     file.write_text(json.dumps(content | {key: value for key, value in change.items() if key not in row}))
     with pytest.raises(UsageError, match="is no trade-off of this version"):
         tradeoff_report(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"rows": []}, {"notes": 1}, {"versions": [1]}, {"scene": 0.5}, {"light": "torch"}, {"mean_px": "much"},
+               {"seconds": {"line-joint": 3}}],
+)  # fmt: skip
+def test_a_comparison_with_other_content_is_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    row = {
+        "strategy": "line-joint", "light": "line", "scene": "<i>street", "air": "20m", "rule": "energy",
+        "time_ms": 50.0, "pixels": 100, "mean_px": 0.1, "good": 0.9, "confident_wrong": 0.0, "valid": 0.9,
+    }  # fmt: skip
+    content = {"rows": [row | {key: value for key, value in change.items() if key in row}], "verdict": "complete"}
+    content |= {"notes": [], "strategies": {}, "seconds": {}, "versions": {}}
+    file = tmp_path / COMPARISON_FILE
+    file.write_text(json.dumps(content))
+    assert change.keys() & row.keys() or "<i>" not in comparison_report(tmp_path)
+    file.write_text(json.dumps(content | {key: value for key, value in change.items() if key not in row}))
+    with pytest.raises(UsageError, match="is no comparison of this version"):
+        comparison_report(tmp_path)
+
+
+def test_a_comparison_of_numbers_that_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
+    row = {"strategy": "line-joint", "light": "line", "scene": "s", "air": "20m", "rule": "energy", "pixels": 100}
+    odd = ((0.0, 0.1), (-5.0, 1e308), (1e-300, 0.0), (1e300, -1.0))
+    rows = [row | {"time_ms": ms, "mean_px": px, "good": 2.0, "confident_wrong": -1.0} for ms, px in odd]
+    content = {"rows": rows, "verdict": "?", "notes": [], "strategies": {}, "seconds": {}, "versions": {}}
+    (tmp_path / COMPARISON_FILE).write_text(json.dumps(content))
+    with pytest.raises(UsageError, match="is no comparison of this version"):
+        comparison_report(tmp_path)
 
 
 @pytest.mark.parametrize("scene", ["[street]", "{a: 1}"])

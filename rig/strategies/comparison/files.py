@@ -1,4 +1,4 @@
-"""Writes the files of a comparison: strategies.json, strategies.csv and two pictures.
+"""Writes the files of a comparison: strategies.json, strategies.csv, two pictures, and report.html, a page with all.
 
 `strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility (only
 written if an air has a visibility). Both show the best strategy of each kind. Strategies are of one kind if the first
@@ -9,16 +9,24 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Final
+from pathlib import Path
+from typing import Annotated, Final
 
+from pydantic import BaseModel, Field
+
+from calibration.errors import digits
+from drivers.json_text import parse_json
+from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX
-from rig.report.charts import Panel, Series, chart_svg
+from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
 from rig.report.csv_file import csv_of
+from rig.report.page import Section, page, paragraph, side_by_side, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
 from rig.strategies.comparison.places import CLEAR, RAMP, visibility_m
 
+COMPARISON_FILE: Final = "strategies.json"
 COLOURS: Final = ("#009e73", "#0072b2", "#d55e00", "#cc79a7", "#e69f00", "#56b4e9", "#7b8896", "#8c564b", "#000000",
                   "#9467bd", "#b8b800")  # fmt: skip
 """Colours of kinds, in the order in which they come; the first eight can be told apart by the colour-blind."""
@@ -31,12 +39,98 @@ SHOWN_MS: Final = 50.0
 
 def write_files(folder: RunFolder, done: Comparison) -> Comparison:
     """Write everything, make the folder appear and return the comparison with its folder."""
-    folder.write_json("strategies.json", {**done.as_json(), "versions": versions()})
+    content = {**done.as_json(), "versions": versions()}
+    folder.write_json(COMPARISON_FILE, content)
     folder.write_text("strategies.csv", csv_text(done.rows))
     folder.write_text("strategies.svg", time_svg(done.rows))
-    if any(visible is not None for visible in (visibility_m(row.air) for row in done.rows)):
+    if _has_visibility(done.rows):
         folder.write_text("strategies-visibility.svg", visibility_svg(done.rows))
+    folder.write_text("report.html", _page(folder.path.name, _ComparisonFile.model_validate(content)))
     return replace(done, folder=folder.publish())
+
+
+def _has_visibility(rows: Sequence[StrategyRow]) -> bool:
+    return any(visibility_m(row.air) is not None for row in rows)
+
+
+class _ComparisonFile(BaseModel):
+    """Parts of the file that a page needs."""
+
+    rows: Annotated[list[StrategyRow], Field(min_length=1)]
+    verdict: str
+    notes: list[str]
+    strategies: dict[str, str]
+    seconds: dict[str, dict[str, float]]
+    versions: dict[str, str]
+
+
+def comparison_report(folder: Path) -> str:
+    """The text of the HTML file on a comparison in a folder. Raises UsageError if it cannot be read."""
+    file = folder / COMPARISON_FILE
+    try:
+        return _page(folder.absolute().name, _ComparisonFile.model_validate(parse_json(file.read_bytes())))
+    except (OSError, ValueError, ArithmeticError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise UsageError(
+            f"{file} is no comparison of this version ({reason}); run rig tradeoff with strategies again"
+        ) from error
+
+
+def _page(name: str, content: _ComparisonFile) -> str:
+    rows = content.rows
+    ways = list(dict.fromkeys(row.strategy for row in rows))
+    said = f"{len(rows)} measurements: {len(ways)} ways to measure depth"
+    note = (
+        "Mean error in px, pixels within 2 % of the depth in %, confident wrong ones in %. A missing answer counts as "
+    )
+    note += f"{MISSING_PX:g} px. -: cannot measure in so short a time."
+    sections: list[Section] = [("Error over time", _charts(_time_panels(rows), _notes(rows)))]
+    if _has_visibility(rows):
+        some = _at_shown_time(rows)
+        sections.append((f"Error and range over visibility, {some[0].time_ms:g} ms",
+                         _charts(_visibility_panels(some), _notes(some))))  # fmt: skip
+    first = len(sections)
+    for scene, air, rule in dict.fromkeys((row.scene, row.air, row.rule) for row in rows):
+        some = [row for row in rows if (row.scene, row.air, row.rule) == (scene, air, rule)]
+        where = scene if air is None else f"{scene}, {_air_name(air)}"
+        sections.append((f"{where}, equal {rule}", _figures_table(some)))
+    sections[first] = (sections[first][0], paragraph(note, small=True) + sections[first][1])
+    last = {row.strategy: row for row in rows if row.rule == rows[0].rule}
+    sources = [
+        (way, last[way].light, last[way].laser_class or "-", last[way].laser_class_still or "-",
+         digits(sum(content.seconds.get(way, {}).values()), 3), content.strategies.get(way, ""))
+        for way in ways if way in last
+    ]  # fmt: skip
+    head = ("way", "lights", "laser class", "if it stands", "s of the computer", "what it does")
+    sections += [
+        ("Sources", table(head, sources)),
+        ("Versions", table(("", ""), [(name, number) for name, number in content.versions.items()])),
+    ]
+    box = verdict_box(content.verdict, f"{said}.", content.notes, good=content.verdict == "complete")
+    return page(f"Comparison {name}", [box], sections)
+
+
+def _charts(panels: Sequence[Panel], notes: Sequence[str]) -> str:
+    series = {each.label: each for panel in panels for each in panel.series}
+    charts = side_by_side([panel_svg(panel) for panel in panels])
+    return legend(list(series.values())) + charts + "".join(paragraph(note, small=True) for note in notes)
+
+
+def _figures_table(rows: Sequence[StrategyRow]) -> str:
+    """A line for each strategy, a column for each time."""
+    times = sorted({row.time_ms for row in rows})
+    found = {(row.strategy, row.time_ms): row for row in rows}
+
+    def cell(row: StrategyRow | None) -> str:
+        if row is None or row.mean_px is None or row.good is None or row.confident_wrong is None:
+            return "-"
+        return f"{row.mean_px:.2f} / {100 * row.good:.0f} / {100 * row.confident_wrong:.1f}"
+
+    ways = dict.fromkeys(row.strategy for row in rows)
+    return table(
+        ("", *(f"{time_ms:g} ms" for time_ms in times)),
+        [(way, *(cell(found.get((way, time_ms))) for time_ms in times)) for way in ways],
+    )
 
 
 def csv_text(rows: Sequence[StrategyRow]) -> str:
@@ -62,8 +156,12 @@ def best_of_kinds(rows: Sequence[StrategyRow]) -> list[str]:
 
 def time_svg(rows: Sequence[StrategyRow]) -> str:
     """Error over time: a panel for each air and rule, the mean over all scenes."""
+    return chart_svg(_time_panels(rows), title="Ways to measure depth: error over time", across=3, notes=_notes(rows))
+
+
+def _time_panels(rows: Sequence[StrategyRow]) -> list[Panel]:
     shown = best_of_kinds(rows)
-    panels = [
+    return [
         Panel(
             title=f"{'own air' if air is None else _air_name(air)}{'' if rule == 'energy' else ', equal irradiance'}",
             x_label="time of a measurement, ms",
@@ -73,18 +171,27 @@ def time_svg(rows: Sequence[StrategyRow]) -> str:
         for rule in dict.fromkeys(row.rule for row in rows)
         for air in dict.fromkeys(row.air for row in rows)
     ]
-    return chart_svg(panels, title="Ways to measure depth: error over time", across=3, notes=_notes(rows))
 
 
 def visibility_svg(rows: Sequence[StrategyRow]) -> str:
     """Error and range over visibility, for the time nearest to SHOWN_MS and the rule of the first row. Raises
     ValueError if no row has a visibility."""
-    rule = rows[0].rule
-    some = [row for row in rows if row.rule == rule and visibility_m(row.air) is not None]
+    some = _at_shown_time(rows)
+    title = f"Ways to measure depth: {some[0].time_ms:g} ms"
+    return chart_svg(_visibility_panels(some), title=title, notes=_notes(some))
+
+
+def _at_shown_time(rows: Sequence[StrategyRow]) -> list[StrategyRow]:
+    """The rows with a visibility that are shown over it: those of the first row's rule and of one time. Raises
+    ValueError if there is none."""
+    some = [row for row in rows if row.rule == rows[0].rule and visibility_m(row.air) is not None]
     time_ms = min((row.time_ms for row in some), key=lambda each: abs(math.log(each / SHOWN_MS)))
-    some = [row for row in some if row.time_ms == time_ms]
+    return [row for row in some if row.time_ms == time_ms]
+
+
+def _visibility_panels(some: Sequence[StrategyRow]) -> list[Panel]:
     shown = best_of_kinds(some)
-    panels = [
+    return [
         Panel("error", "visibility, m (right end: clear air)", "mean error, px", _curves(some, shown, _visible)),
         Panel(
             "range: 90 % of the pixels within 2 %",
@@ -93,7 +200,6 @@ def visibility_svg(rows: Sequence[StrategyRow]) -> str:
             _curves([row for row in some if row.scene == RAMP] or some, shown, _visible, _range),
         ),
     ]
-    return chart_svg(panels, title=f"Ways to measure depth: {time_ms:g} ms", notes=_notes(some))
 
 
 def _curves(

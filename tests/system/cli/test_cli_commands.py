@@ -155,7 +155,7 @@ def test_version_and_no_command(rig: Rig) -> None:
         (("scan", "--scene", "strret", "--dry-run"), "did you mean 'street'?"),
         (("scan", "", "--dry-run"), "the argument behind 'scan' is empty; give it a value or leave it out"),
         (("scan", "--out="), "'--out=' is empty"),
-        (("scan", "--exposures", "1e3"), "Invalid value '1e3' for '--exposures'"),
+        (("scan", "--exposures", "1e3"), "--exposures is '1e3', which is no whole number"),
         (("replay", "taken", "--block-frames", "0"), "'0'"),
         (("export", "taken"), "'KIND'"),
         (("scan", "x" * 300), "anything else is the path of a YAML file"),

@@ -122,8 +122,8 @@ def test_a_trade_off_has_the_page_that_it_wrote_itself(rig: Rig, small: Path) ->
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("gone",), "gone does not exist; name the folder of a run, a calibration, a trade-off or a study"),
-        (("empty",), "empty holds no run, no calibration, no trade-off and no study; name the folder"),
+        (("gone",), "gone does not exist; name the folder of a run, a calibration, a trade-off, a comparison"),
+        (("empty",), "empty holds no run, no calibration, no trade-off, no comparison and no study; name the folder"),
         (("notes.txt",), "notes.txt is a file; name the folder"),
         (("RUN", "empty"), "empty holds no run"),
         (("RUN", "--map", "9"), "map 9 is not in"),

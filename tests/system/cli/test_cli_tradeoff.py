@@ -106,7 +106,9 @@ def test_other_ways_to_measure_depth_beside_the_line_scan(rig: Rig, small: Path,
     assert len(told["rows"]) == 2 * 2 * 2
     assert told["verdict"] == "complete"
     names = {file.name for file in (tmp_path / "out").iterdir()}
-    assert names == {"strategies.json", "strategies.csv", "strategies.svg", "strategies-visibility.svg"}
+    assert names == {"strategies.json", "strategies.csv", "strategies.svg", "strategies-visibility.svg", "report.html"}
+    assert rig("report", tmp_path / "out", "--out", "page.html").code == 0
+    assert Path("page.html").read_text() == (tmp_path / "out" / "report.html").read_text()
     shown = rig(*asked)
     assert shown.code == 0, shown.err
     for words in ("ramp, clear air, equal energy", "line-argmax", "laser class", "US 2023/0410333"):

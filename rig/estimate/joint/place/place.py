@@ -142,13 +142,14 @@ def line_width(
     return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
 
 
-def amplitudes_of(places: Places, trusted: Bools | None = None) -> tuple[Float32, Float64]:
+def amplitudes_of(places: Places, trusted: Bools) -> tuple[Float32, Float64]:
     """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of the stripes that each
     of them represents.
 
-    trusted: (rows, columns), which stripes count; None for all. If none counts, the amplitudes are 1.
+    trusted: (rows, columns), which stripes count. Places without a stripe have the least amplitude there is; if they
+    counted, lesson after lesson would believe in ever darker stripes. If none counts, the amplitudes are 1.
     """
-    found = places.amplitude[places.scale > 0 if trusted is None else trusted & (places.scale > 0)]
+    found = places.amplitude[trusted & (places.scale > 0)]
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
     if len(found) == 0:
         return np.ones(4, np.float32), shares

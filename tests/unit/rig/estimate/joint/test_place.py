@@ -160,17 +160,22 @@ def stripes_at(x_px) -> StripeTable:
     return table
 
 
-def test_amplitudes_stand_for_those_of_the_stripes():
+def test_amplitudes_stand_for_those_of_the_trusted_stripes():
     places = new_places(40, 50)
-    assert len(amplitudes_of(places)[0]) == 4
+    everywhere = np.ones((40, 50), bool)
+    assert amplitudes_of(places, everywhere)[0].tolist() == [1, 1, 1, 1]  # no stripe at all
     values = np.geomspace(0.1, 10, 1000).astype(np.float32)
     places.amplitude[:20], places.scale[:20] = values.reshape(20, 50), 1
     places.amplitude[20:] = 1e6  # nothing is seen there
-    amplitude, weight = amplitudes_of(places)
+    amplitude, weight = amplitudes_of(places, everywhere)
     assert weight.sum() == pytest.approx(1)
     assert np.all(np.diff(amplitude) > 0)
     below = np.cumsum(weight) - 0.5 * weight
     np.testing.assert_allclose(np.log10(amplitude), -1 + 2 * below, atol=0.01)
+    # Half as many answers where there is no stripe change nothing, as long as nobody trusts them.
+    places.amplitude[20:30], places.scale[20:30], trusted = 0.03, 1, everywhere.copy()
+    trusted[20:30] = False
+    assert amplitudes_of(places, trusted)[0].tolist() == amplitude.tolist()
 
 
 def surfaces(rows, columns, seed=1):
