@@ -91,7 +91,7 @@ def test_places_of_any_counts_move_a_pixel_at_most(rig, exposures, rate, haze, a
     for values in (places.light, places.scale, places.amplitude, places.haze, places.known):
         assert np.isfinite(values[there]).all()
     assert np.all(places.haze[there] >= 0)
-    amplitude, weight = amplitudes_of(places, there)
+    amplitude, weight = amplitudes_of(places, there, others=True)
     assert np.all(amplitude > 0)
     assert weight.sum() == pytest.approx(1)
     table = StripeTable.empty(ROWS, COLUMNS)

@@ -44,7 +44,7 @@ sweep. Measured: up to 0.0004 in the same fog, 0.001 at 0.8 of the visibility, 0
 AGREE_PX = np.float32(1.0)
 """In the lessons that check stripes by contrast, a stripe teaches only if contrast alone puts it this near, in px."""
 TRUSTED = np.float32(0.5)
-"""An answer teaches if its trust (`fill_trust`) exceeds this."""
+"""An answer teaches if its trust (`fill_trust`) exceeds this; in lessons with contrast only these teach amplitudes."""
 COUNTING_THREADS = 4
 """Most threads that count: more only get into each other's way, since counting waits for memory."""
 MISLED = 0.2
@@ -239,7 +239,8 @@ class Joint:
         # Amplitudes are relative to the scale of the model that they are written into.
         weigh_light(volume, tables.sweep, state_of(model), stripes.x_px, places, self._workers)
         self._workers.settle()
-        amplitude, weight = amplitudes_of(places, stripes.confidence > TRUSTED)
+        certain = stripes.confidence > TRUSTED
+        amplitude, weight = amplitudes_of(places, certain, others=witness_px is None)
         lines = lines_of(volume, next_lattice(geometry), stripes)
         shares = halo_shares(model, geometry.width if model.halo.any() else 0)
         light = places.light[lines.row, lines.column]

@@ -142,17 +142,22 @@ def line_width(
     return float(np.sqrt(np.clip(moment / light - pixel_variance, *LINE_SIGMA_PX**2)))
 
 
-def amplitudes_of(places: Places, trusted: Bools) -> tuple[Float32, Float64]:
+def amplitudes_of(places: Places, trusted: Bools, *, others: bool) -> tuple[Float32, Float64]:
     """Four amplitudes, dark to bright, that represent those of a map's stripes, and the share of the stripes that each
     of them represents.
 
-    trusted: (rows, columns), which stripes count. Places without a stripe have the least amplitude there is; if they
-    counted, lesson after lesson would believe in ever darker stripes. If none counts, the amplitudes are 1.
+    trusted: (rows, columns), which stripes count for certain. others: whether all others count too, since many of them
+    are dark stripes. But where most places have no stripe, what is measured there would make the amplitudes darker with
+    every lesson; so none is darker than that of the trusted stripes by more than BEYOND. If no stripe is trusted, the
+    amplitudes are 1.
     """
-    found = places.amplitude[trusted & (places.scale > 0)]
+    there = places.scale > 0
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
-    if len(found) == 0:
-        return np.ones(4, np.float32), shares
     middle = [0.5 * (a + b) for a, b in pairwise(edges)]
-    amplitude = np.quantile(found, middle)
+    certain = places.amplitude[trusted & there]
+    if len(certain) == 0:
+        return np.ones(4, np.float32), shares
+    amplitude = np.quantile(certain, middle)
+    if others:
+        amplitude = np.maximum(np.quantile(places.amplitude[there], middle), amplitude / BEYOND)
     return np.maximum(amplitude, amplitude[-1] / DARKEST).astype(np.float32), shares

@@ -225,7 +225,7 @@ def test_another_map_than_the_last_one_can_be_shown(tmp_path: Path) -> None:
     run = made_run(tmp_path / "three", maps=3)
     assert "Depth, map 2." in report(run)
     assert "Depth, map 1." in report(run, number=1)
-    with pytest.raises(UsageError, match=r"map 3 is not in .*three; it has 0 to 2$"):
+    with pytest.raises(UsageError, match=r"map 3 is not in .*three; it has maps 0 to 2, so name one of these$"):
         read_run(run, 3)
 
 

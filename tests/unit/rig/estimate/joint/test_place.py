@@ -12,7 +12,7 @@ from rig.estimate.joint.labels.grid import label_grid
 from rig.estimate.joint.place import light, pool
 from rig.estimate.joint.place import place as place_module
 from rig.estimate.joint.place.light import LEAST_FLUX, _dark_over_lit
-from rig.estimate.joint.place.place import PAIRS, amplitudes_of, line_width, new_places, place, profile_table
+from rig.estimate.joint.place.place import BEYOND, PAIRS, amplitudes_of, line_width, new_places, place, profile_table
 from rig.estimate.joint.place.places import BESIDE_PX, MOST_FLUX, REACH_PX
 from rig.estimate.joint.place.pool import (
     SIGMAS,
@@ -160,22 +160,32 @@ def stripes_at(x_px) -> StripeTable:
     return table
 
 
-def test_amplitudes_stand_for_those_of_the_trusted_stripes():
+@pytest.mark.parametrize("others", [False, True])
+def test_amplitudes_stand_for_those_of_the_stripes(others):
     places = new_places(40, 50)
     everywhere = np.ones((40, 50), bool)
-    assert amplitudes_of(places, everywhere)[0].tolist() == [1, 1, 1, 1]  # no stripe at all
+    assert amplitudes_of(places, everywhere, others=others)[0].tolist() == [1, 1, 1, 1]  # no stripe at all
     values = np.geomspace(0.1, 10, 1000).astype(np.float32)
     places.amplitude[:20], places.scale[:20] = values.reshape(20, 50), 1
     places.amplitude[20:] = 1e6  # nothing is seen there
-    amplitude, weight = amplitudes_of(places, everywhere)
+    amplitude, weight = amplitudes_of(places, everywhere, others=others)
     assert weight.sum() == pytest.approx(1)
     assert np.all(np.diff(amplitude) > 0)
     below = np.cumsum(weight) - 0.5 * weight
     np.testing.assert_allclose(np.log10(amplitude), -1 + 2 * below, atol=0.01)
-    # Half as many answers where there is no stripe change nothing, as long as nobody trusts them.
-    places.amplitude[20:30], places.scale[20:30], trusted = 0.03, 1, everywhere.copy()
-    trusted[20:30] = False
-    assert amplitudes_of(places, trusted)[0].tolist() == amplitude.tolist()
+
+
+def test_places_without_a_stripe_make_amplitudes_darker_within_limits_only():
+    places = new_places(40, 50)
+    places.amplitude[:10], places.scale[:10] = np.geomspace(0.1, 10, 500).astype(np.float32).reshape(10, 50), 1
+    places.amplitude[10:], places.scale[10:] = 1e-4, 1
+    trusted = np.zeros((40, 50), bool)
+    trusted[:10] = True
+    certain = amplitudes_of(places, trusted, others=False)[0]
+    assert certain[0] > 0.1
+    np.testing.assert_allclose(amplitudes_of(places, trusted, others=True)[0], certain / BEYOND, rtol=1e-5)
+    # Where nobody trusts an answer, all of them say nothing.
+    assert amplitudes_of(places, np.zeros((40, 50), bool), others=True)[0].tolist() == [1, 1, 1, 1]
 
 
 def surfaces(rows, columns, seed=1):
