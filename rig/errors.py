@@ -61,13 +61,21 @@ def absent(path: Path, step: str, among: Callable[[Path], bool] = lambda _: True
 
     among: whether a path beside it is of the right kind.
     """
-    try:
-        beside = [each.name for each in path.parent.iterdir() if not each.name.startswith(".") and among(each)]
-    except OSError:
-        beside = []
-    close = get_close_matches(path.name, beside, n=1)
-    meant = f"did you mean '{path.with_name(close[0])}'? " if close else ""
+    similar = similar_beside(path, among)
+    meant = "" if similar is None else f"did you mean '{similar}'? "
     return f"{path} does not exist; {meant}{step}"
+
+
+def similar_beside(path: Path, among: Callable[[Path], bool]) -> Path | None:
+    """The path beside another one that has the most similar name; None if there is none of the right kind, `among`.
+    Hidden ones do not count."""
+    try:
+        names = [each.name for each in path.parent.iterdir() if not each.name.startswith(".")]
+    except OSError:
+        return None
+    close = get_close_matches(path.name, names, n=5)
+    similar = map(path.with_name, close)
+    return next((each for each in similar if each.exists() and among(each)), None)
 
 
 class PlanError(UsageError):

@@ -13,6 +13,7 @@ from rig.config.overrides import PathLike
 from rig.errors import UsageError, absent
 from rig.requests import ScanRequest
 from rig.run_folder.manifest import MANIFEST, read_manifest
+from rig.run_folder.runs import is_run
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +38,7 @@ def repeat(run: PathLike) -> tuple[RigConfig, ScanRequest]:
     if manifest is None:
         step = "name the folder of a scan, 'rig runs' lists them"
         if not folder.exists():
-            raise UsageError(absent(folder, step, Path.is_dir))
+            raise UsageError(absent(folder, step, is_run))
         raise UsageError(f"{folder} has no {MANIFEST}; {step}")
     if manifest.get("command") != "scan" or not manifest.get("config"):
         what = manifest.get("command") or "unknown command"

@@ -13,6 +13,7 @@ from rig.errors import DamagedRecordingError, UsageError, absent
 from rig.progress import tell_stage
 from rig.run_folder.map_files import read_depth
 from rig.run_folder.pictures import ply_points
+from rig.run_folder.runs import is_run
 
 
 class Region(NamedTuple):
@@ -47,7 +48,7 @@ def quality(run: PathLike, region: str | Sequence[int] | None = None) -> RegionQ
     if not files:
         step = "name the folder of a calibrated run, or make maps with 'rig reconstruct'"
         if not folder.exists():
-            raise UsageError(absent(folder, step, Path.is_dir))
+            raise UsageError(absent(folder, step, is_run))
         raise UsageError(f"{folder} holds no depth maps (depth/*.npy); {step}")
     given = None if region is None else Region.parse(region if isinstance(region, str) else ",".join(map(str, region)))
     tally: RegionTally | None = None

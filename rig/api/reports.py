@@ -82,7 +82,7 @@ def report(
 
 def _kind(path: Path) -> str:
     if not path.exists():
-        raise UsageError(absent(path, _WHAT))
+        raise UsageError(absent(path, _WHAT, _can_be_shown))
     if path.is_dir():
         if is_run(path):
             return "run"
@@ -102,6 +102,14 @@ def _kind(path: Path) -> str:
     if path.suffix in (".yaml", ".yml"):
         return "calibration"
     raise UsageError(f"{path} is a file; {_WHAT}")
+
+
+def _can_be_shown(path: Path) -> bool:
+    try:
+        _kind(path)
+    except UsageError:
+        return False
+    return True
 
 
 def _calibration(path: Path) -> str:

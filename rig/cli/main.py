@@ -188,12 +188,13 @@ def _say_why(error: BaseException, arguments: list[str]) -> int:
     names: Sequence[str] = getattr(getattr(error, "param", None), "opts", ())
     given = [value for name in names for value in _values(name, arguments)]
     if given and wanted is not None:
-        message = f"{names[0]} is {given[-1]!r}, which is no {wanted}"
+        wrong = next((value for value in given if repr(value) in message), given[-1])
+        message = f"{names[0]} is {wrong!r}, which is no {wanted}"
     elif given and not any(value in message for value in given):
         message = message.replace("Invalid value", f"Invalid value {given[-1]!r}", 1)
     meant = ""
-    if hasattr(error, "possibilities"):  # an option that does not exist
-        unknown = str(getattr(error, "option_name", ""))
+    unknown = getattr(error, "option_name", None)
+    if isinstance(unknown, str) and hasattr(error, "possibilities"):  # an option that does not exist
         similar = list(error.possibilities or ())
         best = [name for name in similar if name.startswith(unknown)] or similar
         meant = f"did you mean {best[0]}? " if best else ""

@@ -215,7 +215,9 @@ def quality_command(
 def report_command(
     run: Annotated[
         Path,
-        typer.Argument(metavar="RUN", help="folder of a run, calibration, trade-off or study", show_default=False),
+        typer.Argument(
+            metavar="RUN", help="folder of a run, calibration, trade-off, comparison or study", show_default=False
+        ),
     ],
     other: Annotated[
         Path | None, typer.Argument(metavar="[OTHER]", help="a run to stand beside it", show_default=False)

@@ -21,7 +21,7 @@ from drivers.registry import SLOTS, kinds, lookup
 from rig.config.bundled import BUNDLED, bundled_rigs, bundled_scenes
 from rig.config.completion import block_text, completed
 from rig.config.models import CubePlan, RigConfig
-from rig.errors import UsageError
+from rig.errors import UsageError, similar_beside
 
 FLAGS: Mapping[Key, str] = {
     ("world", "scene"): "scene",
@@ -179,12 +179,9 @@ def find_config(name_or_path: str | Path) -> Path:
         return BUNDLED / f"{path.name}.yaml"
     if os.path.isdir(path):
         raise UsageError(f"config {path} is a folder; name the YAML file in it")
-    try:
-        beside = [str(one) for one in path.parent.iterdir() if one.suffix in SUFFIXES]
-    except OSError:
-        beside = []
-    close = difflib.get_close_matches(path.stem, names, n=1) or difflib.get_close_matches(str(path), beside, n=1)
-    meant = f"did you mean '{close[0]}'? " if close else ""
+    close = difflib.get_close_matches(path.stem, names, n=1)
+    similar = close[0] if close else similar_beside(path, lambda one: one.suffix in SUFFIXES and one.is_file())
+    meant = "" if similar is None else f"did you mean '{similar}'? "
     if path.name in (one.name for one in bundled_scenes()):
         meant = f"it is a scene, which is chosen by `scene={path.name}`; "
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "

@@ -22,6 +22,7 @@ from rig.requests import ExportRequest
 from rig.run_folder.folder import RunFolder
 from rig.run_folder.manifest import read_manifest
 from rig.run_folder.pictures import Picture
+from rig.run_folder.runs import is_run
 
 EXPORT_KINDS: Final = ("npy", "hdf5", "ply", "png", "mp4")
 PICTURE_KINDS: Final = ("png", "mp4")
@@ -187,6 +188,8 @@ class _Export:
 
 
 def _check(run: Path, kind: str, request: ExportRequest) -> None:
+    if not run.exists():
+        raise UsageError(absent(run, "name the folder of a run", is_run))
     known, view = kind in EXPORT_KINDS, request.view
     summed, per_s = request.frames_per_picture, request.pictures_per_s
     fps = f"{per_s or 0.0:g}"
@@ -194,7 +197,6 @@ def _check(run: Path, kind: str, request: ExportRequest) -> None:
     no_film = known and kind != "mp4"
     checks = [
         (not known, f"export kind {kind!r} is unknown; choose one of {', '.join(EXPORT_KINDS)}"),
-        (not run.exists(), absent(run, "name the folder of a run", Path.is_dir)),
         (view not in (None, *VIEWS), f"view {view!r} is unknown; choose one of {', '.join(VIEWS)}"),
         (view in VIEWS and no_pictures, f"view {view!r} is of pictures, {no_pictures}"),
         (summed is not None and no_pictures, f"`frames_per_picture={summed}` are summed for pictures, {no_pictures}"),

@@ -53,7 +53,7 @@ pre {{ background: #f6f8fa; padding: 0.6em 0.8em; font-size: 12px; line-height: 
   td, th {{ padding-right: 0.7em }} .many {{ font-size: 0.78em }} .many :is(td, th) {{ padding-right: 0.5em }} }}
 @media print {{
   body {{ max-width: none; padding: 0; font-size: 10pt }} h2, h3, .legend {{ break-after: avoid }}
-  figure, img, svg, tr, .good, .bad, .short {{ break-inside: avoid }} .wide {{ overflow: visible }}
+  figure, img, svg, tr, .good, .bad, .short, pre:not(.long) {{ break-inside: avoid }} .wide {{ overflow: visible }}
   pre.long {{ columns: 2; font-size: 7pt }}
   .good, .bad, pre {{ background: none; border: 1px solid {FAINT}; border-left-width: 6px }}
   .side figure {{ flex-basis: 45% }} .side > svg {{ flex-basis: 30% }}
@@ -66,7 +66,7 @@ MOST_BYTES: Final = 2_000_000
 MANY_COLUMNS: Final = 5
 """Cells of tables with so many columns keep their lines, and the table scrolls where it is too wide."""
 _SHORT_ROWS: Final = 30
-"""A table or text with at most so many lines is not broken at the end of a sheet of paper."""
+"""A table or text with at most so many lines is kept on one sheet of paper if it fits."""
 PICTURE_PX: Final = (512, 400, 320, 240, 120)
 """Longest side of embedded pictures; the smaller ones are for reports that would otherwise be too large."""
 JPEG_QUALITY: Final = 82
@@ -151,7 +151,7 @@ def scaled_picture(values: NDArray[np.floating], scale: Scale, caption: str) -> 
     The labels of the scale are text of the page, so they can be read however small the picture is shown.
     """
     marks = "".join(
-        f'<span style="left:{100 * (share if scale.rising else 1 - share):.1f}%">{escape(text)}</span>'
+        f'<span style="left:{100 * (share if scale.brighter else 1 - share):.1f}%">{escape(text)}</span>'
         for share, text in scale.marks()
     )
     bar = f'<div class="scale"><img alt="" src="{_embedded(png_bytes(scale.bar()), "png")}">{marks}</div>'

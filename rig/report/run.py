@@ -115,6 +115,8 @@ def _pictures(runs: Sequence[RunFacts], most_px: int) -> str:
     def depth(run: RunFacts, at: str) -> str:
         if run.depth_m is None:
             return ""
+        if limits is None:
+            return no_picture(f"No pixel has a depth, {at}.")
         return scaled_picture(_thinned(run.depth_m, most_px), depth_scale(limits), f"Depth, {at}.")
 
     def confidence(run: RunFacts, at: str) -> str:

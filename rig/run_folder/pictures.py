@@ -45,7 +45,8 @@ class Scale:
 
     unit: written behind the labels. palette: the colour map. absent: short name of pixels without a value. log: whether
     the scale is logarithmic; both ends are then above 0. labels: values and texts to write, instead of round values.
-    steps: number of different colours; with fewer colours a PNG file is smaller.
+    steps: number of different colours; with fewer colours a PNG file is smaller. falling: whether the labels fall where
+    the values rise, as confidence does over doubt.
     """
 
     bright: float
@@ -56,6 +57,7 @@ class Scale:
     log: bool = False
     labels: Sequence[tuple[float, str]] = ()
     steps: int = 255
+    falling: bool = False
 
     def colours(self, values: NDArray[np.floating]) -> Picture:
         """RGB, uint8 (..., 3), of values (...); `NO_VALUE` for NaN. Values beyond an end have that end's colour."""
@@ -100,17 +102,16 @@ class Scale:
         return picture
 
     def bar(self) -> Picture:
-        """All colours of the scale in one line, from the smaller of the values at its ends to the larger one: RGB (1,
-        255, 3)."""
-        shares = np.linspace(0, 1, 255) if self.rising else np.linspace(1, 0, 255)
+        """All colours of the scale in one line, from the smallest label to the largest one: RGB (1, 255, 3)."""
+        shares = np.linspace(0, 1, 255) if self.brighter else np.linspace(1, 0, 255)
         low, high = (math.log(end) if self.log else end for end in (self.dark, self.bright))
         values = low + shares * (high - low)
         return self.colours(np.exp(values) if self.log else values)[None]
 
     @property
-    def rising(self) -> bool:
-        """Whether larger values are brighter."""
-        return self.bright > self.dark
+    def brighter(self) -> bool:
+        """Whether colours get brighter from the smallest label to the largest one."""
+        return (self.bright > self.dark) != self.falling
 
     def marks(self, most: int = _LABELS) -> list[tuple[float, str]]:
         """Labels of the scale: the place of each, from 0 at `dark` to 1 at `bright`, and its text.
@@ -164,7 +165,7 @@ def depth_scale(limits: tuple[float, float] | None) -> Scale:
 _TICKS: Final = ("0", "0.5", "0.9", "0.99", "0.999")
 CONFIDENCE_SCALE: Final = Scale(
     1e-3, 1.0, palette="cividis", absent="no depth", log=True,
-    labels=tuple((1 - float(text), text) for text in _TICKS),
+    labels=tuple((1 - float(text), text) for text in _TICKS), falling=True,
 )  # fmt: skip
 """Scale of doubt, 1 - confidence, with labels of confidence: from 0.999 on all is bright."""
 

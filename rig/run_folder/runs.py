@@ -69,8 +69,9 @@ def list_runs(folder: Path, request: RunsRequest) -> list[RunEntry]:
     since = None if request.since is None else since_when(request.since, datetime.now(UTC))
     entries = [_entry(run) for run in _runs_below(folder, MOST_DEPTH)]
     kept = [(entry, newest) for entry, newest in entries if _passes(entry, request, since)]
-    # Maps made later of the same frames follow the scan, which has the same time.
-    return [entry for entry, _ in sorted(kept, key=lambda each: (each[0].taken, each[1], each[0].folder))]
+    # Maps that were made later of a scan's frames have the scan's time.
+    kept.sort(key=lambda each: (each[0].taken, each[0].command != "scan", each[1], each[0].folder))
+    return [entry for entry, _ in kept]
 
 
 def since_when(text: str, now: datetime) -> datetime:

@@ -44,7 +44,8 @@ sweep. Measured: up to 0.0004 in the same fog, 0.001 at 0.8 of the visibility, 0
 AGREE_PX = np.float32(1.0)
 """In the lessons that check stripes by contrast, a stripe teaches only if contrast alone puts it this near, in px."""
 TRUSTED = np.float32(0.5)
-"""An answer teaches if its trust (`fill_trust`) exceeds this; in lessons with contrast only these teach amplitudes."""
+"""An answer teaches if its trust (`fill_trust`) exceeds this. In lessons with contrast only these teach amplitudes; in
+all others they limit them."""
 COUNTING_THREADS = 4
 """Most threads that count: more only get into each other's way, since counting waits for memory."""
 MISLED = 0.2
@@ -248,7 +249,7 @@ class Joint:
             lines, light, tables.sweep, state_of(model), shares, model.hot_flux(), self._workers
         )  # fmt: skip
         model = replace(model, amplitude=amplitude, weight=weight, belief=belief)
-        return model, float(np.mean(stripes.confidence > TRUSTED)), error
+        return model, float(np.mean(certain)), error
 
 
 @dataclass(slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Writes the files of a comparison: strategies.json, strategies.csv, two pictures, and report.html, a page with all.
+"""Writes the files of a comparison: strategies.json, strategies.csv, two pictures, and report.html with all tables.
 
 `strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility (only
 written if an air has a visibility). Both show the best strategy of each kind. Strategies are of one kind if the first
@@ -14,7 +14,6 @@ from typing import Annotated, Final
 
 from pydantic import BaseModel, Field
 
-from calibration.errors import digits
 from drivers.json_text import parse_json
 from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX
@@ -24,7 +23,8 @@ from rig.report.page import Section, page, paragraph, side_by_side, table, verdi
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
-from rig.strategies.comparison.places import CLEAR, RAMP, visibility_m
+from rig.strategies.comparison.places import RAMP, visibility_m
+from rig.strategies.comparison.tables import FIGURES_NOTE, air_name, figures_tables, ranges_table, sources_table
 
 COMPARISON_FILE: Final = "strategies.json"
 COLOURS: Final = ("#009e73", "#0072b2", "#d55e00", "#cc79a7", "#e69f00", "#56b4e9", "#7b8896", "#8c564b", "#000000",
@@ -43,14 +43,10 @@ def write_files(folder: RunFolder, done: Comparison) -> Comparison:
     folder.write_json(COMPARISON_FILE, content)
     folder.write_text("strategies.csv", csv_text(done.rows))
     folder.write_text("strategies.svg", time_svg(done.rows))
-    if _has_visibility(done.rows):
+    if _at_shown_time(done.rows):
         folder.write_text("strategies-visibility.svg", visibility_svg(done.rows))
     folder.write_text("report.html", _page(folder.path.name, _ComparisonFile.model_validate(content)))
     return replace(done, folder=folder.publish())
-
-
-def _has_visibility(rows: Sequence[StrategyRow]) -> bool:
-    return any(visibility_m(row.air) is not None for row in rows)
 
 
 class _ComparisonFile(BaseModel):
@@ -78,35 +74,23 @@ def comparison_report(folder: Path) -> str:
 
 def _page(name: str, content: _ComparisonFile) -> str:
     rows = content.rows
-    ways = list(dict.fromkeys(row.strategy for row in rows))
-    said = f"{len(rows)} measurements: {len(ways)} ways to measure depth"
-    note = (
-        "Mean error in px, pixels within 2 % of the depth in %, confident wrong ones in %. A missing answer counts as "
-    )
-    note += f"{MISSING_PX:g} px. -: cannot measure in so short a time."
+    ways = {row.strategy for row in rows}
     sections: list[Section] = [("Error over time", _charts(_time_panels(rows), _notes(rows)))]
-    if _has_visibility(rows):
-        some = _at_shown_time(rows)
-        sections.append((f"Error and range over visibility, {some[0].time_ms:g} ms",
-                         _charts(_visibility_panels(some), _notes(some))))  # fmt: skip
-    first = len(sections)
-    for scene, air, rule in dict.fromkeys((row.scene, row.air, row.rule) for row in rows):
-        some = [row for row in rows if (row.scene, row.air, row.rule) == (scene, air, rule)]
-        where = scene if air is None else f"{scene}, {_air_name(air)}"
-        sections.append((f"{where}, equal {rule}", _figures_table(some)))
-    sections[first] = (sections[first][0], paragraph(note, small=True) + sections[first][1])
-    last = {row.strategy: row for row in rows if row.rule == rows[0].rule}
-    sources = [
-        (way, last[way].light, last[way].laser_class or "-", last[way].laser_class_still or "-",
-         digits(sum(content.seconds.get(way, {}).values()), 3), content.strategies.get(way, ""))
-        for way in ways if way in last
-    ]  # fmt: skip
-    head = ("way", "lights", "laser class", "if it stands", "s of the computer", "what it does")
+    if some := _at_shown_time(rows):
+        title = f"Error and range over visibility, {some[0].time_ms:g} ms"
+        sections.append((title, _charts(_visibility_panels(some), _notes(some))))
+    sections += [(each.title, table(each.head, each.lines)) for each in figures_tables(rows)]
+    sections.append(("What the figures are", paragraph(FIGURES_NOTE)))
+    if (found := ranges_table(rows)) is not None:
+        sections.append((found.title, table(found.head, found.lines)))
+    sources = sources_table(rows, content.seconds)
     sections += [
-        ("Sources", table(head, sources)),
-        ("Versions", table(("", ""), [(name, number) for name, number in content.versions.items()])),
+        (sources.title, table(sources.head, sources.lines)),
+        ("What they do", table(("", ""), list(content.strategies.items()))),
+        ("Versions", table(("", ""), list(content.versions.items()))),
     ]
-    box = verdict_box(content.verdict, f"{said}.", content.notes, good=content.verdict == "complete")
+    said = f"{len(rows)} measurement{'s' * (len(rows) != 1)}, {len(ways)} way{'s' * (len(ways) != 1)} to measure depth."
+    box = verdict_box(content.verdict, said, content.notes, good=content.verdict == "complete")
     return page(f"Comparison {name}", [box], sections)
 
 
@@ -114,23 +98,6 @@ def _charts(panels: Sequence[Panel], notes: Sequence[str]) -> str:
     series = {each.label: each for panel in panels for each in panel.series}
     charts = side_by_side([panel_svg(panel) for panel in panels])
     return legend(list(series.values())) + charts + "".join(paragraph(note, small=True) for note in notes)
-
-
-def _figures_table(rows: Sequence[StrategyRow]) -> str:
-    """A line for each strategy, a column for each time."""
-    times = sorted({row.time_ms for row in rows})
-    found = {(row.strategy, row.time_ms): row for row in rows}
-
-    def cell(row: StrategyRow | None) -> str:
-        if row is None or row.mean_px is None or row.good is None or row.confident_wrong is None:
-            return "-"
-        return f"{row.mean_px:.2f} / {100 * row.good:.0f} / {100 * row.confident_wrong:.1f}"
-
-    ways = dict.fromkeys(row.strategy for row in rows)
-    return table(
-        ("", *(f"{time_ms:g} ms" for time_ms in times)),
-        [(way, *(cell(found.get((way, time_ms))) for time_ms in times)) for way in ways],
-    )
 
 
 def csv_text(rows: Sequence[StrategyRow]) -> str:
@@ -163,7 +130,7 @@ def _time_panels(rows: Sequence[StrategyRow]) -> list[Panel]:
     shown = best_of_kinds(rows)
     return [
         Panel(
-            title=f"{'own air' if air is None else _air_name(air)}{'' if rule == 'energy' else ', equal irradiance'}",
+            title=f"{'own air' if air is None else air_name(air)}{'' if rule == 'energy' else ', equal irradiance'}",
             x_label="time of a measurement, ms",
             y_label="mean error, px",
             series=_curves([row for row in rows if (row.air, row.rule) == (air, rule)], shown, lambda row: row.time_ms),
@@ -174,18 +141,19 @@ def _time_panels(rows: Sequence[StrategyRow]) -> list[Panel]:
 
 
 def visibility_svg(rows: Sequence[StrategyRow]) -> str:
-    """Error and range over visibility, for the time nearest to SHOWN_MS and the rule of the first row. Raises
-    ValueError if no row has a visibility."""
+    """Error and range over visibility, for the time nearest to SHOWN_MS and the first rule. At least one row must have
+    a visibility."""
     some = _at_shown_time(rows)
     title = f"Ways to measure depth: {some[0].time_ms:g} ms"
     return chart_svg(_visibility_panels(some), title=title, notes=_notes(some))
 
 
 def _at_shown_time(rows: Sequence[StrategyRow]) -> list[StrategyRow]:
-    """The rows with a visibility that are shown over it: those of the first row's rule and of one time. Raises
-    ValueError if there is none."""
-    some = [row for row in rows if row.rule == rows[0].rule and visibility_m(row.air) is not None]
-    time_ms = min((row.time_ms for row in some), key=lambda each: abs(math.log(each / SHOWN_MS)))
+    """The rows that are shown over visibility: of those with one, those of the first rule and of one time. Empty if no
+    row has a visibility."""
+    some = [row for row in rows if visibility_m(row.air) is not None]
+    some = [row for row in some if row.rule == some[0].rule]
+    time_ms = min((row.time_ms for row in some), key=lambda each: abs(math.log(each / SHOWN_MS)), default=None)
     return [row for row in some if row.time_ms == time_ms]
 
 
@@ -233,10 +201,6 @@ def _visible(row: StrategyRow) -> float:
 
 def _range(row: StrategyRow) -> float | None:
     return row.range_m
-
-
-def _air_name(air: str) -> str:
-    return "clear air" if air == CLEAR else air if visibility_m(air) is None else f"visibility {air}"
 
 
 def _notes(rows: Sequence[StrategyRow]) -> list[str]:

@@ -137,6 +137,9 @@ def test_a_name_that_means_no_config_is_told_what_it_is(tmp_path):
     for absent in ("none.yaml", "nodir/", "nodir/none"):
         assert "that path does not exist" in problems(absent)[0]
     assert "is a folder" in problems(tmp_path)[0]
+    (tmp_path / "bench-rig.yaml").touch()
+    assert f"did you mean '{tmp_path / 'bench-rig.yaml'}'?" in problems(tmp_path / "bench-rg.yaml")[0]
+    assert "did you mean" not in problems(tmp_path / "another.yaml")[0]
 
 
 def test_overrides_lie_over_the_file_and_none_leaves_it_alone(write):

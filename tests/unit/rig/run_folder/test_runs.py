@@ -81,11 +81,13 @@ def test_a_run_is_listed_if_it_passes_every_filter(runs: Path, filters: dict[str
 
 
 def test_maps_made_later_of_the_same_frames_follow_their_scan(tmp_path: Path) -> None:
-    for name, written_s in (("scan", 1000), ("again", 2000), ("a-first", 3000)):
-        folder = make(tmp_path / name, "2025-11-29T10:00:00+00:00")
+    # The scan's folder was written to last, as by a repair.
+    for name, written_s in (("scan", 4000), ("again", 2000), ("a-third", 3000)):
+        command = "scan" if name == "scan" else "reconstruct"
+        folder = make(tmp_path / name, "2025-11-29T10:00:00+00:00", command=command)
         for file in folder.iterdir():
             os.utime(file, (written_s, written_s))
-    assert names(tmp_path) == ["scan", "again", "a-first"]
+    assert names(tmp_path) == ["scan", "again", "a-third"]
 
 
 def test_a_damaged_run_is_listed_with_the_reason_and_hides_no_other(runs: Path) -> None:
