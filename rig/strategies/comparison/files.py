@@ -79,8 +79,8 @@ def _page(name: str, content: _ComparisonFile) -> str:
     if some := _at_shown_time(rows):
         title = f"Error and range over visibility, {some[0].time_ms:g} ms"
         sections.append((title, _charts(_visibility_panels(some), _notes(some))))
+    sections.append(("Each figure in the tables", paragraph(FIGURES_NOTE)))
     sections += [(each.title, table(each.head, each.lines)) for each in figures_tables(rows)]
-    sections.append(("What the figures are", paragraph(FIGURES_NOTE)))
     if (found := ranges_table(rows)) is not None:
         sections.append((found.title, table(found.head, found.lines)))
     sources = sources_table(rows, content.seconds)
