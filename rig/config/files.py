@@ -187,7 +187,7 @@ def find_config(name_or_path: str | Path) -> Path:
     missing = "" if plain and not str(name_or_path).endswith(("/", os.sep)) else "that path does not exist; "
     raise UsageError(
         f"{NO_CONFIG} '{name_or_path}': {missing}{meant}bundled configs are {', '.join(names) or 'none'}; "
-        "anything else is the path of a YAML file, as 'rig config show NAME > FILE' makes one"
+        "anything else is the path of a YAML file; 'rig config show' prints one to begin with"
     )
 
 

@@ -132,7 +132,7 @@ def is_run(folder: Path) -> bool:
 
 
 def _entry(folder: Path) -> tuple[RunEntry, datetime]:
-    """What a list says of a run, and the time of its newest file."""
+    """The line of a list for a run, and the time of its newest file."""
     manifest: Mapping[str, Any] = {}
     summary: Mapping[str, Any] = {}
     problem = ""

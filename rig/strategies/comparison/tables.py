@@ -45,7 +45,7 @@ def _figures(row: StrategyRow) -> str:
 
 
 def ranges_table(rows: Sequence[StrategyRow]) -> FiguresTable | None:
-    """How far each strategy reaches on the slanted wall; None if that scene was not measured."""
+    """The range of each strategy on the slanted wall; None if that scene was not measured."""
     found = ranges(rows, RAMP)
     if not found:
         return None
@@ -60,7 +60,7 @@ def ranges_table(rows: Sequence[StrategyRow]) -> FiguresTable | None:
 
 
 def sources_table(rows: Sequence[StrategyRow], seconds: Mapping[str, Mapping[str, float]]) -> FiguresTable:
-    """What each strategy lights, its laser classes and the computing time.
+    """A line for each strategy: what it lights, its laser classes, and the computing time.
 
     Classes are those of the longest time, and of the first rule by which the strategy was measured. seconds: by
     strategy and scene.
