@@ -41,6 +41,8 @@ BEYOND = 3.0
 """Factor by which brightness may lie beyond the learned amplitudes, either way."""
 DARKEST = 300.0
 """Largest ratio of the brightest of the four amplitudes of `amplitudes_of` to another."""
+ENOUGH_TRUSTED = 0.5
+"""Share of trusted answers from which on the others are taken for dark stripes, rather than for no stripes."""
 SLOPE_STEP_PX = 0.05
 LEAST_PHOTONS = 100.0
 """Least light of all stripes, in photons per exposure, from which `line_width` gives a width."""
@@ -148,8 +150,8 @@ def amplitudes_of(places: Places, trusted: Bools, *, others: bool) -> tuple[Floa
 
     trusted: (rows, columns), which stripes count for certain. others: whether all others count too, since many of them
     are dark stripes. But where most places have no stripe, what is measured there would make the amplitudes darker with
-    every lesson; so none is darker than that of the trusted stripes by more than BEYOND. If no stripe is trusted, the
-    amplitudes are 1.
+    every lesson. So if fewer than ENOUGH_TRUSTED are trusted, no amplitude is darker than that of the trusted stripes
+    by a factor of more than BEYOND. If no stripe is trusted, the amplitudes are 1.
     """
     there = places.scale > 0
     edges, shares = (0.0, 0.2, 0.5, 0.8, 1.0), np.array([0.2, 0.3, 0.3, 0.2])
@@ -159,5 +161,6 @@ def amplitudes_of(places: Places, trusted: Bools, *, others: bool) -> tuple[Floa
         return np.ones(4, np.float32), shares
     amplitude = np.quantile(certain, middle)
     if others:
-        amplitude = np.maximum(np.quantile(places.amplitude[there], middle), amplitude / BEYOND)
+        least = amplitude / BEYOND if len(certain) < ENOUGH_TRUSTED * np.count_nonzero(there) else 0.0
+        amplitude = np.maximum(np.quantile(places.amplitude[there], middle), least)
     return np.maximum(amplitude, amplitude[-1] / DARKEST).astype(np.float32), shares

@@ -184,6 +184,9 @@ def test_places_without_a_stripe_make_amplitudes_darker_within_limits_only():
     certain = amplitudes_of(places, trusted, others=False)[0]
     assert certain[0] > 0.1
     np.testing.assert_allclose(amplitudes_of(places, trusted, others=True)[0], certain / BEYOND, rtol=1e-5)
+    # Where most answers are trusted, the others are dark stripes.
+    places.scale[18:] = 0
+    assert amplitudes_of(places, trusted, others=True)[0][0] < certain[0] / BEYOND
     # Where nobody trusts an answer, all of them say nothing.
     assert amplitudes_of(places, np.zeros((40, 50), bool), others=True)[0].tolist() == [1, 1, 1, 1]
 
