@@ -31,11 +31,13 @@ from rig.strategies.comparison.compare import (
 from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
 from rig.strategies.comparison.places import air_problems, scene_file, scene_path, visibility_m
 from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
+from rig.strategies.comparison.tables import figures_tables, ranges_table, sources_table
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
 from tests.system import small_rig
 
 covers(visibility_m, scene_file, OpenScene, measure_once, Reached, Comparison, require_form, run_comparison, ranges)
+covers(sources_table)
 
 
 @pytest.fixture(scope="module")
@@ -355,3 +357,24 @@ def test_csv_of_rows_reads_back():
 def test_classes_of_sources_stand_for_all_lights():
     assert compare.PROTECTED in find_strategy("bch").sentence
     assert compare.PROTECTED not in find_strategy("gray-spad").sentence
+
+
+def test_tables_have_a_line_for_each_way_also_if_it_was_measured_by_one_rule_alone():
+    def row(strategy: str, time_ms: float, **changes: object) -> StrategyRow:
+        values = {"mean_px": 0.004, "good": 0.98, "confident_wrong": 0.01, **changes}
+        return replace(StrategyRow(strategy, "line", "street", "20m", "energy", time_ms, 100), **values)
+
+    rows = [
+        row("line-joint", 1.0, mean_px=None, too_short="needs 2 ms"),
+        row("line-joint", 50.0, laser_class="3R"),
+        row("gray-spad", 50.0, rule="irradiance", laser_class="1"),
+        row("line-joint", 50.0, rule="irradiance", laser_class="1"),
+    ]
+    energy, irradiance = figures_tables([*rows, row("line-edge", 50.0)])
+    assert energy.title == "street, visibility 20m, equal energy"
+    assert energy.head == ("", "1 ms", "50 ms")
+    assert energy.lines == [("line-joint", "-", "0.004 98 1.0"), ("line-edge", "", "0.004 98 1.0")]
+    assert [line[0] for line in irradiance.lines] == ["gray-spad", "line-joint"]
+    sources = sources_table(rows, {"line-joint": {"street": 2.0}})
+    assert sources.lines == [("line-joint", "line", "3R", "-", "2"), ("gray-spad", "line", "1", "-", "0")]
+    assert ranges_table(rows) is None
