@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.report.charts import FAINT, INK
+from rig.report.charts import FAINT, INK, Panel, legend, panel_svg
 from rig.run_folder.pictures import Picture, Scale, png_bytes
 
 _STYLE: Final = f"""
@@ -192,3 +192,9 @@ def no_picture(why: str) -> str:
 def side_by_side(parts: Sequence[str]) -> str:
     """Charts or tables beside each other, as many as fit; on a phone one below the other."""
     return f'<div class="side">{"".join(parts)}</div>'
+
+
+def charts(panels: Sequence[Panel]) -> str:
+    """Charts beside each other, as many as fit, with one legend of all their curves above."""
+    series = {each.label: each for panel in panels for each in panel.series}
+    return legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels])

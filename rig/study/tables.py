@@ -16,8 +16,8 @@ from rig.batch.store import LIST, Row, failure_files, read_failures, read_rows
 from rig.batch.task import CASE
 from rig.config.bundled import short_names
 from rig.errors import UsageError
-from rig.report.charts import Panel, Series, legend, panel_svg
-from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
+from rig.report.charts import Panel, Series
+from rig.report.page import charts, page, paragraph, preformatted, table, verdict_box
 
 Line = dict[str, Any]
 
@@ -87,13 +87,11 @@ def study_report(folder: Path) -> str:
     columns = list(dict.fromkeys([*(label for label in labels if label in known), *known]))
     cells = [[_cell(line.get(key)) for key in columns] for line in lines[:SHOWN_LINES]]
     more = paragraph(f"{len(lines) - SHOWN_LINES} more lines are in table.csv", small=True)
-    series = {each.label: each for panel in panels for each in panel.series}
-    charts = legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels])
     return page(
         f"Study {folder.absolute().name}",
         [verdict_box(verdict, said, list(map(failure_line, failures)), good=whole)],
         [
-            ("Figures", charts if panels else ""),
+            ("Figures", charts(panels) if panels else ""),
             *((name.capitalize(), "".join(drawings)) for name in OWN_FIGURES if (drawings := _drawings(folder / name))),
             ("All cases", table(list(map(_in_words, columns)), cells) + (more if len(lines) > SHOWN_LINES else "")),
             ("Repeat failed cases", preformatted("\n".join(each["command"] for each in failures)) if failures else ""),

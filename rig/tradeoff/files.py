@@ -16,9 +16,9 @@ from drivers.json_text import parse_json
 from rig.config.files import portable_content
 from rig.config.models import RigConfig
 from rig.errors import UsageError
-from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
+from rig.report.charts import Panel, Series, chart_svg
 from rig.report.csv_file import csv_of
-from rig.report.page import page, paragraph, preformatted, side_by_side, table, verdict_box
+from rig.report.page import charts, page, paragraph, preformatted, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.tradeoff.rows import Clock, TradeoffRow, TrialSetting
@@ -112,9 +112,8 @@ def _page(name: str, content: Mapping[str, Any], rows: Sequence[TradeoffRow]) ->
 def _charts(rows: Sequence[TradeoffRow], ci95_by: str) -> str:
     """The panels of the picture, as many beside each other as fit."""
     panels = _panels(rows)
-    series = {series.label: series for panel in panels for series in panel.series}
     notes = "".join(paragraph(note, small=True) for note in _notes(rows, ci95_by))
-    return legend(list(series.values())) + side_by_side([panel_svg(panel) for panel in panels]) + notes
+    return charts(panels) + notes
 
 
 COLOURS = {"argmax": "#7b8896", "edge": "#d55e00", "likelihood": "#0072b2", "joint": "#009e73"}

@@ -17,9 +17,9 @@ from pydantic import BaseModel, Field
 from drivers.json_text import parse_json
 from rig.errors import UsageError
 from rig.geometry.stripe_table import MISSING_PX
-from rig.report.charts import Panel, Series, chart_svg, legend, panel_svg
+from rig.report.charts import Panel, Series, chart_svg
 from rig.report.csv_file import csv_of
-from rig.report.page import Section, page, paragraph, side_by_side, table, verdict_box
+from rig.report.page import Section, charts, page, paragraph, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
@@ -95,9 +95,7 @@ def _page(name: str, content: _ComparisonFile) -> str:
 
 
 def _charts(panels: Sequence[Panel], notes: Sequence[str]) -> str:
-    series = {each.label: each for panel in panels for each in panel.series}
-    charts = side_by_side([panel_svg(panel) for panel in panels])
-    return legend(list(series.values())) + charts + "".join(paragraph(note, small=True) for note in notes)
+    return charts(panels) + "".join(paragraph(note, small=True) for note in notes)
 
 
 def csv_text(rows: Sequence[StrategyRow]) -> str:
