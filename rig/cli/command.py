@@ -308,16 +308,16 @@ def print_json(content: Mapping[str, Any]) -> None:
     tell(in_options(json_text(content)))
 
 
-def show_page(*, stays: bool = False, required: bool = True) -> "subprocess.Popen[bytes] | None":
+def show_page(*, stays: bool = False, opens: bool = False, required: bool = True) -> "subprocess.Popen[bytes] | None":
     """Open the live page of this process's runs; returns its process. If the page cannot be opened, this is said on
     stderr, and None is returned.
 
-    stays: as in `start_page`. required: whether a missing package raises UsageError instead.
+    stays, opens: as in `start_page`. required: whether a missing package raises UsageError instead.
     """
     from rig.live.page import page_problem, start_page
 
     problem = page_problem()
-    page = None if problem is not None and not required else start_page(stays=stays)
+    page = None if problem is not None and not required else start_page(stays=stays, opens=opens)
     if page is not None and page.poll() is None:
         return page
     say(f"warning: no page in the browser{f': {problem}' if problem else ''}; everything else goes on")

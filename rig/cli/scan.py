@@ -26,7 +26,7 @@ from rig.cli.command import (
 from rig.cli.completion import one_of
 from rig.cli.progress import progress
 from rig.errors import UsageError
-from rig.live.page import end_page
+from rig.live.page import end_page, has_desktop
 from rig.requests import ReconstructRequest, ScanRequest, StrategiesRequest, TradeoffRequest, options_of
 
 if TYPE_CHECKING:
@@ -118,10 +118,18 @@ def demo_command(
     out: Annotated[
         Path | None, typer.Option("--out", help="folder to write, new or empty", show_default="runs/demo-DATE-TIME")
     ] = None,
-    view: Annotated[bool, typer.Option(help="show it in the browser; it stays there until Ctrl-C")] = True,
+    view: Annotated[bool, typer.Option(help="serve a page that shows it, until Ctrl-C")] = True,
+    opens: Annotated[
+        bool | None,
+        typer.Option(
+            "--open/--no-open",
+            help="open that page in this computer's browser",
+            show_default="yes, if there is a desktop",
+        ),
+    ] = None,
 ) -> int:
     """Show the program with the simulated rig: a scan, its recording, its replay, and all of it in the browser."""
-    page = show_page(stays=True, required=False) if view else None
+    page = show_page(stays=True, opens=has_desktop() if opens is None else opens, required=False) if view else None
     try:
         with progress():
             shown = api.demonstrate(dated("demo-") if out is None else out, tell=say, on_space=say_space)

@@ -34,12 +34,19 @@ def page_problem() -> str | None:
     return f"the page in the browser needs viser; install it: {install_command('viser')}"
 
 
-def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.Popen[bytes]":
+def has_desktop() -> bool:
+    """Whether a browser can be opened on this computer. On Linux, only with a graphical session: else Python would open
+    a text browser in the terminal, if there is one."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def start_page(*, stays: bool = False, opens: bool = False, port: int | None = None) -> "subprocess.Popen[bytes]":
     """Start the page and wait, READY_S at most, until a browser can open it. If its process has ended by then, it has
     said why on stderr.
 
     stays: whether the page stays after the run. Otherwise it ends once this process or its run has ended and no browser
-    shows it. port: None for that of `ViewRequest`. Raises UsageError if there can be no page here.
+    shows it. opens: whether it is opened in this computer's browser. port: None for that of `ViewRequest`. Raises
+    UsageError if there can be no page here.
     """
     if (problem := page_problem()) is not None:
         raise UsageError(problem)
@@ -47,7 +54,7 @@ def start_page(*, stays: bool = False, port: int | None = None) -> "subprocess.P
     command = [sys.executable, "-m", "spadrig", "view", "--live", "--port", str(port), "--process", str(os.getpid())]
     tell_stage("starting the page")
     process = subprocess.Popen(
-        [*command, *([] if stays else ["--until-closed"])],
+        [*command, *([] if stays else ["--until-closed"]), *(["--open"] if opens else [])],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         start_new_session=True,

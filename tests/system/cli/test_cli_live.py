@@ -55,7 +55,7 @@ def test_align_says_the_power_and_its_share_and_a_line_a_second(
     assert "laser at 10 mW, 10% of its limit; --power sets another" in ran.err
     assert ran.err.count("px wide") == 1
     assert ran.out.startswith("sweep ")
-    assert opened.started == [{"stays": False}], "the page opens by itself where viser is installed"
+    assert opened.started == [{"stays": False, "opens": False}], "the page opens by itself where viser is installed"
 
 
 def test_align_prints_one_json_object_at_the_end(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +104,7 @@ def test_scan_and_replay_open_a_page_with_view(rig: Rig, small: Path, monkeypatc
     opened = pages(monkeypatch)
     assert rig("scan", small, "--record", "--out", "take", "--view", "--json").code == 0
     assert rig("replay", "take", "--clock", "max", "--view", "--out", "again").code == 0
-    assert opened.started == [{"stays": False}, {"stays": False}]
+    assert opened.started == [{"stays": False, "opens": False}] * 2
 
 
 def test_a_page_that_cannot_be_opened_ends_no_scan(rig: Rig, small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,9 +119,10 @@ def test_demo_records_replays_and_keeps_the_page_until_ctrl_c(
 ) -> None:
     opened = pages(monkeypatch)
     monkeypatch.setattr("rig.api.demo.SIMULATED", small)
+    monkeypatch.setattr("rig.cli.scan.has_desktop", lambda: True)
     ran = rig("demo", "--out", "shown")
     assert ran.code == 0
-    assert opened.started == [{"stays": True}]
+    assert opened.started == [{"stays": True, "opens": True}]
     assert opened.ended == 1
     assert "3. the 3 depth maps of both are the same, bit for bit" in ran.err
     assert "next: rig view shown/recording" in ran.out
@@ -147,5 +148,6 @@ def test_demo_that_is_interrupted_exits_4_and_ends_its_page(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rig.api.demo.replay", interrupted)
-    ran = rig("demo", "--out", "shown")
+    ran = rig("demo", "--out", "shown", "--no-open")
     assert (ran.code, opened.ended) == (4, 1)
+    assert opened.started == [{"stays": True, "opens": False}]

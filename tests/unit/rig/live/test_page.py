@@ -10,7 +10,7 @@ import pytest
 
 from rig.errors import UsageError
 from rig.live import page as page_module
-from rig.live.page import NICE, end_page, page_problem, start_page
+from rig.live.page import NICE, end_page, has_desktop, page_problem, start_page
 
 
 @pytest.fixture
@@ -38,9 +38,11 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "said"
 
 
-@pytest.mark.parametrize(("stays", "more"), [(False, " --until-closed"), (True, "")])
-def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, more: str) -> None:
-    page = start_page(stays=stays, port=port)
+@pytest.mark.parametrize(
+    ("stays", "opens", "more"), [(False, False, " --until-closed"), (True, False, ""), (True, True, " --open")]
+)
+def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, opens: bool, more: str) -> None:
+    page = start_page(stays=stays, opens=opens, port=port)
     try:
         with socket.create_connection(("127.0.0.1", port), 1):
             assert program.read_text() == f"view --live --port {port} --process {os.getpid()}{more}"
@@ -50,6 +52,18 @@ def test_a_page_is_waited_for_and_ended(program: Path, port: int, stays: bool, m
     finally:
         end_page(page)
     assert page.poll() is not None
+
+
+def test_on_linux_only_a_graphical_session_has_a_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(page_module.sys, "platform", "linux")
+    assert not has_desktop()
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    assert has_desktop()
+    monkeypatch.delenv("WAYLAND_DISPLAY")
+    monkeypatch.setattr(page_module.sys, "platform", "win32")
+    assert has_desktop()
 
 
 def test_a_page_that_ends_at_once_is_not_waited_for(program: Path) -> None:
