@@ -26,7 +26,7 @@ from rig.estimate.joint.tables import MOST_BYTES, JointTables, bytes_of, grid_of
 from rig.estimate.joint.temporal import TemporalPrior
 from rig.estimate.online_learning import LearningSetting, OnlineLearner, first_model
 from rig.estimate.row.ambient import ambient_map
-from rig.estimate.row.em import expect, learn_again, lines_of, next_lattice
+from rig.estimate.row.em import evidence, learn_again, lines_of, next_lattice
 from rig.estimate.row.inputs import halo_shares, state_of
 from rig.estimate.row.model import RowModel
 from rig.geometry.stripe_table import StripeTable
@@ -199,15 +199,15 @@ class Joint:
         """
         lines = lines_of(volume, next_lattice(geometry))
 
-        def evidence(model: RowModel) -> float:
-            return expect(lines, geometry, model, self._workers).evidence
+        def explains(model: RowModel) -> float:
+            return evidence(lines, geometry, model, self._workers)
 
         if kept.halo.any():
-            return kept if evidence(kept) > evidence(fresh) else None
+            return kept if explains(kept) > explains(fresh) else None
         profile = np.column_stack([kept.profile[:, :3], fresh.profile[:, 3]]).astype(np.float32)
         medium = replace(fresh, profile=profile, row_gain=kept.row_gain, column_gain=kept.column_gain)
-        own = evidence(fresh)
-        if evidence(medium) < own - KEPT_WORSE * abs(own):
+        own = explains(fresh)
+        if explains(medium) < own - KEPT_WORSE * abs(own):
             return None
         return replace(fresh, amplitude=kept.amplitude, weight=kept.weight, line_sigma_px=kept.line_sigma_px)
 

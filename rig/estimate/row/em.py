@@ -12,10 +12,11 @@ Gains and amplitudes follow from the sums, too; the line width is found by trial
 haze is assumed to fall exponentially with the path length.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import cv2
 import numba
@@ -63,15 +64,17 @@ PRIOR_PHOTONS = 100.0
 START_EXTINCTIONS_PER_M = (0.0, 0.1, 0.4, 1.5)
 """Extinctions that are tried as a start for a first sweep: clear air to dense fog."""
 
+Result = TypeVar("Result")
+
 
 class Expectation(NamedTuple):
-    """Weighted counts of one round; see `learn_rows`."""
+    """Weighted counts of one round; see `learn_rows`. rows_seen and columns_seen have no rows if gains are not to be
+    learned from them."""
 
     levels: Float64
     rows_seen: Float64
     columns_seen: Float64
     amplitude_mass: Float64
-    evidence: float
 
     def plus(self, other: "Expectation") -> "Expectation":
         """The sums over the lines of both."""
@@ -106,23 +109,44 @@ def lines_of(volume: CountVolume, where: tuple[Int32, Int32], known: StripeTable
 
 
 def expect(
-    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers, *, reach_px: int | None = None
+    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers, *, gains: bool = False
 ) -> Expectation:
-    """The expectation step of `model` over some lines. reach_px: of `line_profile`, None for the line's own."""
+    """The expectation step of `model` over some lines. gains: whether gains of rows and columns are to be learned."""
     sweep, state, hot_flux = sweep_of(geometry), state_of(model), model.hot_flux()
+
+    def expect_piece(piece: Lines) -> Expectation:
+        levels, mass = np.zeros((BINS, LEVELS)), np.zeros(len(state.amplitude) + 1)
+        rows_seen, columns_seen = (np.zeros((n if gains else 0, 2)) for n in (geometry.rows, geometry.columns))
+        learn_rows(sweep, state, piece, hot_flux, levels, rows_seen, columns_seen, mass)
+        return Expectation(levels, rows_seen, columns_seen, mass)
+
+    return reduce(Expectation.plus, _of_pieces(lines, expect_piece, workers))
+
+
+def evidence(
+    lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers, *, reach_px: int | None = None
+) -> float:
+    """Natural logarithm of the probability of the counts of some lines, up to a constant of the counts.
+
+    reach_px: of `line_profile`, None for the line's own.
+    """
+    sweep, state = sweep_of(geometry), state_of(model)
     if reach_px is not None:
         state = state._replace(psi=line_profile(model.line_sigma_px, reach_px))
-    # Fixed pieces, added in order: the sums do not depend on the number of threads.
+    return sum(_of_pieces(lines, lambda piece: rows_evidence(sweep, state, piece), workers))
+
+
+def _of_pieces(lines: Lines, work: Callable[[Lines], Result], workers: RowWorkers) -> list[Result]:
+    """Results for PIECES pieces of the lines, in order. Sums of them do not depend on the number of threads."""
     edges = np.linspace(0, len(lines.row), PIECES + 1).astype(int)
-    parts: dict[int, Expectation] = {}
+    results: dict[int, Result] = {}
 
-    def work(first: int, last: int) -> None:
+    def some(first: int, last: int) -> None:
         for i in range(first, last):
-            part = slice(edges[i], edges[i + 1])
-            parts[i] = _expect_piece(sweep, state, _some(lines, part), geometry, hot_flux)
+            results[i] = work(_some(lines, slice(edges[i], edges[i + 1])))
 
-    workers.over(PIECES, work)
-    return reduce(Expectation.plus, (parts[i] for i in range(PIECES)))
+    workers.over(PIECES, some)
+    return [results[i] for i in range(PIECES)]
 
 
 def _some(lines: Lines, part: slice) -> Lines:
@@ -135,14 +159,6 @@ def _every(lines: Lines, wanted: int) -> Lines:
     return _some(lines, slice(None, None, max(len(lines.row) // wanted, 1)))
 
 
-def _expect_piece(sweep: Sweep, state: RowState, lines: Lines, geometry: SweepGeometry, hot_flux: float) -> Expectation:
-    levels = np.zeros((BINS, LEVELS))
-    rows_seen, columns_seen = np.zeros((geometry.rows, 2)), np.zeros((geometry.columns, 2))
-    mass = np.zeros(len(state.amplitude) + 1)
-    evidence = learn_rows(sweep, state, lines, hot_flux, levels, rows_seen, columns_seen, mass)
-    return Expectation(levels, rows_seen, columns_seen, mass, float(evidence))
-
-
 def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, workers: RowWorkers) -> RowModel:
     """Learn the row model from a first sweep: try several starts and refine the likeliest."""
     first, last = (lines_of(volume, lattice(geometry, lines)) for lines in (FIRST_LINES, LAST_LINES))
@@ -152,21 +168,20 @@ def learn_first(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
     for extinction in START_EXTINCTIONS_PER_M:
         model = start_model(volume, geometry, ambient, extinction)
         for _ in range(2):
-            seen = expect(few, geometry, model, workers)
-            model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
-        starts.append((expect(few, geometry, model, workers).evidence, model))
+            model = maximise(model, expect(few, geometry, model, workers), spread=True, free_ambient=guessed)
+        starts.append((evidence(few, geometry, model, workers), model))
     model = max(starts, key=itemgetter(0))[1]
     moves = True
     for i in range(FIRST_ROUNDS):
-        seen = expect(first, geometry, model, workers)
-        model = maximise(model, seen, spread=True, free_ambient=guessed, gains=False)
+        model = maximise(model, expect(first, geometry, model, workers), spread=True, free_ambient=guessed)
         # A width that did not change is tried again only in the last two of these rounds: the model is nearly known.
         if moves or i >= FIRST_ROUNDS - 2:
             width = model.line_sigma_px
             model = fit_line_width(few, geometry, model, workers)
             moves = model.line_sigma_px != width
     for _ in range(LAST_ROUNDS):
-        model = maximise(model, expect(last, geometry, model, workers), spread=False, free_ambient=guessed)
+        seen = expect(last, geometry, model, workers, gains=True)
+        model = maximise(model, seen, spread=False, free_ambient=guessed)
     return model
 
 
@@ -188,7 +203,7 @@ def learn_next(
     seen = expect(lines, geometry, model, workers)
     if before is not None:
         seen = seen.plus(before.faded(FADE))
-    model = maximise(model, seen, spread=False, gains=False)
+    model = maximise(model, seen, spread=False)
     if lines.trust.any():
         return model, seen
     return fit_line_width(_every(lines, START_LINES), geometry, model, workers), seen
@@ -204,8 +219,9 @@ def learn_again(
 ) -> RowModel:
     """The model of a first sweep, learned again with stripes `known` from more than their own rows."""
     lines = lines_of(volume, lattice(geometry, AGAIN_LINES), known)
-    seen = expect(lines, geometry, replace(model, ambient=ambient), workers)
-    return maximise(replace(model, ambient=ambient), seen, spread=True, free_ambient=volume.dark_counts is None)
+    model = replace(model, ambient=ambient)
+    seen = expect(lines, geometry, model, workers, gains=True)
+    return maximise(model, seen, spread=True, free_ambient=volume.dark_counts is None)
 
 
 def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, workers: RowWorkers) -> RowModel:
@@ -218,9 +234,9 @@ def fit_line_width(lines: Lines, geometry: SweepGeometry, model: RowModel, worke
     tried = [
         replace(model, line_sigma_px=float(np.clip(model.line_sigma_px * f, 0.25, 2.4))) for f in (0.87, 1.0, 1.15)
     ]
-    evidence = [expect(lines, geometry, m, workers, reach_px=reach_px).evidence for m in tried]
-    best = int(np.argmax(evidence))
-    return tried[best] if evidence[best] > evidence[1] + WIDTH_EVIDENCE else model
+    found = [evidence(lines, geometry, m, workers, reach_px=reach_px) for m in tried]
+    best = int(np.argmax(found))
+    return tried[best] if found[best] > found[1] + WIDTH_EVIDENCE else model
 
 
 def path_bins(geometry: SweepGeometry) -> tuple[float, float]:
@@ -252,14 +268,15 @@ def start_model(volume: CountVolume, geometry: SweepGeometry, ambient: Float32, 
 def _near_level(volume: CountVolume, geometry: SweepGeometry) -> float:
     """Mean flux of the nearest eighth of the search windows, where hardly any stripe lies."""
     rows, columns = lattice(geometry, 4096)
-    ones = exposures = 0.0
     lo, hi = geometry.x_lo[rows, columns], geometry.x_hi[rows, columns]
     share = np.maximum((hi - lo + 1) // 8, 1)
-    for y, c, a, b, n in zip(rows, columns, lo, hi, share, strict=True):
-        first = (a if geometry.near_is_left else b - n + 1) - volume.x0[c]
-        ones += float(volume.counts[c, y, first : first + n].sum())
-        exposures += float(volume.n_frames[c]) * n
-    return flux(ones, exposures)
+    first = np.where(geometry.near_is_left, lo, hi - share + 1) - volume.x0[columns]
+    # One entry for each of these pixels: number of its row and column, and its place in the window.
+    line = np.repeat(np.arange(len(rows)), share)
+    place = first[line] + np.arange(len(line)) - np.repeat(np.cumsum(share) - share, share)
+    ones = volume.counts[columns[line], rows[line], place].sum(dtype=np.int64)
+    exposures = np.dot(volume.n_frames[columns].astype(np.int64), share)
+    return flux(float(ones), float(exposures))
 
 
 def flux(ones: float, exposures: float) -> float:
@@ -267,15 +284,13 @@ def flux(ones: float, exposures: float) -> float:
     return float(np.log1p(ones / (exposures - ones + 0.5))) if exposures > 0 else 0.0
 
 
-def maximise(
-    model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False, gains: bool = True
-) -> RowModel:
+def maximise(model: RowModel, seen: Expectation, *, spread: bool, free_ambient: bool = False) -> RowModel:
     """The model that explains the weighted counts best. If `model` has a halo, only the prior over positions and the
     probability of 'no stripe' are changed.
 
     spread: whether the amplitude grid may move. free_ambient: whether the level of ambient light was guessed and is
-    learned as well. gains: whether to learn the strength of the haze per row and column, which would drift if it were
-    learned from few lines or from map to map.
+    learned as well. The strength of the haze per row and column is learned if `seen` was made for it. It would drift if
+    it were learned from few lines or from map to map.
     """
     if model.halo.any():
         # A single row cannot tell a halo from haze; `rig.estimate.joint.halo` can.
@@ -302,7 +317,7 @@ def maximise(
     amplitude, weight, none = _amplitudes(model, seen.amplitude_mass, spread)
     # The stated extinction comes only from rows with a certain stripe: a stripe taken for haze would flatten the decay.
     clear = fit_haze(path_m, *_level(seen.levels[:, 8:12]))
-    if gains:
+    if len(seen.rows_seen):
         model = replace(
             model,
             row_gain=_gain(model.row_gain, seen.rows_seen, typical, before),
@@ -417,8 +432,8 @@ LEAST_OWN: Final = 1e-3
 def learn_rows(
     sweep: Sweep, state: RowState, lines: Lines, hot_flux: float, levels: Float64, rows_seen: Float64,
     columns_seen: Float64, amplitude_mass: Float64,
-) -> float:  # fmt: skip
-    """Do the expectation step over some lines, and return the log evidence.
+) -> None:  # fmt: skip
+    """Do the expectation step over some lines.
 
     Rows in which 'no stripe' has a probability of 0.5 or more add nothing to levels 0 to 11, rows_seen and
     columns_seen. Added to levels (bins, LEVELS), in columns:
@@ -427,18 +442,16 @@ def learn_rows(
     - 4 to 7: the same for pixels behind the stripe, in rows more certain than CERTAIN; other lines' haze is ambient;
     - 8 to 11: as 0 to 3, unweighted, for pixels more than CLEAR_PX before the stripe in rows more certain than CLEAR;
     - 12 and 13: stripes, and stripes if all positions were equally likely (see CUT).
-    Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Added to
-    amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe' (see CUT). Pixels with more ambient flux
-    than hot_flux are left out of levels 0 to 11, rows_seen and columns_seen.
+    Added to rows_seen (rows, 2) and columns_seen (columns, 2): ones before the stripe and those expected. Nothing is if
+    both have length 0. Added to amplitude_mass (M + 1,): rows per amplitude, last those with 'no stripe' (see CUT).
+    Pixels with more ambient flux than hot_flux are left out of levels 0 to 11, rows_seen and columns_seen.
     """
     amplitudes = state.amplitude.shape[0]
     row = row_buffers(sweep.window, amplitudes)
-    total = 0.0
     for i in range(lines.row.shape[0]):
-        length, first, last, start, none, cut, evidence = judge_line(sweep, state, row, lines, i)
+        length, first, last, start, none, cut, _ = judge_line(sweep, state, row, lines, i)
         if length == 0:
             continue
-        total += evidence
         if cut < CUT:
             for m in range(amplitudes):
                 amplitude_mass[m] += row.by_amplitude[m]
@@ -451,6 +464,15 @@ def learn_rows(
             _learn_levels(
                 sweep, state, row, where, (length, first, last, start), none, hot_flux, levels, rows_seen, columns_seen
             )
+
+
+@numba.njit(cache=True, nogil=True)
+def rows_evidence(sweep: Sweep, state: RowState, lines: Lines) -> float:
+    """Log evidence of some lines together, each as `judge_line` gives it."""
+    row = row_buffers(sweep.window, state.amplitude.shape[0])
+    total = 0.0
+    for i in range(lines.row.shape[0]):
+        total += judge_line(sweep, state, row, lines, i)[6]
     return total
 
 
@@ -467,47 +489,54 @@ def _learn_levels(
     (y, c, k), (length, first, last, start) = where, span
     step = 1 if sweep.near_is_left else -1
     reach = state.psi.shape[0]
+    # Local names, as in `row_fluxes`.
+    n, before, cell, gain_of, posterior = row.n, row.before, row.cell, row.gain, row.posterior
+    others_of, ambient_of = row.others, state.ambient
     # A doubtful row's pixels behind the stripe would confirm its own guess. For haze, all rows are used.
-    mode, near_mass = mode_of(row.posterior, first, last)
+    mode, near_mass = mode_of(posterior, first, last)
     certain, clear = near_mass > CERTAIN, near_mass > CLEAR
+    gains = rows_seen.shape[0] > 0
     passed = 0.0
     for t in range(length):
-        passed += row.posterior[t]
-        ambient = state.ambient[y, start + step * t]
+        passed += posterior[t]
+        ambient = ambient_of[y, start + step * t]
         if ambient > hot_flux:
             continue
-        gain, others = row.gain[t], row.others[t]
+        gain, others = gain_of[t], others_of[t]
         if others > 0.0:
             # Other lines' haze has the same profile: the factor of the profile grows by their share.
-            own = row.before[t] - ambient - others
+            own = before[t] - ambient - others
             gain *= 1.0 + others / max(own, LEAST_OWN * others)
         # Pixels within the stripe's width count for neither side.
         ahead = 0.0
-        near = row.posterior[t]
+        near = posterior[t]
         for d in range(1, reach + 1):
             if t + d < length:
-                ahead += row.posterior[t + d]
+                ahead += posterior[t + d]
             if t - d >= 0:
-                near += row.posterior[t - d]
+                near += posterior[t - d]
         is_before = max(1.0 - none - passed - ahead, 0.0)
-        b = row.cell[t]
-        levels[b, 0] += is_before * row.n[t]
-        levels[b, 1] += is_before * k
-        levels[b, 2] += is_before * k * gain
-        levels[b, 3] += is_before * k * ambient
-        expected = is_before * k * -np.expm1(-row.before[t])
-        rows_seen[y, 0] += is_before * row.n[t]
-        rows_seen[y, 1] += expected
-        columns_seen[c, 0] += is_before * row.n[t]
-        columns_seen[c, 1] += expected
+        b = cell[t]
+        if is_before > 0.0:
+            levels[b, 0] += is_before * n[t]
+            levels[b, 1] += is_before * k
+            levels[b, 2] += is_before * k * gain
+            levels[b, 3] += is_before * k * ambient
+            if gains:
+                expected = is_before * k * -np.expm1(-before[t])
+                rows_seen[y, 0] += is_before * n[t]
+                rows_seen[y, 1] += expected
+                columns_seen[c, 0] += is_before * n[t]
+                columns_seen[c, 1] += expected
         if clear and t < mode - CLEAR_PX:
-            levels[b, 8] += row.n[t]
+            levels[b, 8] += n[t]
             levels[b, 9] += k
             levels[b, 10] += k * gain
             levels[b, 11] += k * ambient
         if certain:
             is_behind = max(passed - near, 0.0)
-            levels[b, 4] += is_behind * row.n[t]
-            levels[b, 5] += is_behind * k
-            levels[b, 6] += is_behind * k * row.gain[t]
-            levels[b, 7] += is_behind * k * (ambient + others)
+            if is_behind > 0.0:
+                levels[b, 4] += is_behind * n[t]
+                levels[b, 5] += is_behind * k
+                levels[b, 6] += is_behind * k * gain_of[t]
+                levels[b, 7] += is_behind * k * (ambient + others)

@@ -198,7 +198,9 @@ def fit_haze(path_m: Float64, flux: Float64, variance: Float64) -> HazeFit | Non
         design = np.stack([shape, -2.0 * (s - s.min()) * amplitude * shape])
         return amplitude, design, (design * weight) @ design.T
 
-    extinction = float(candidates[int(np.argmin([misfit(float(e)) for e in candidates]))])
+    shapes = np.exp(-2.0 * candidates[:, None] * (s - s.min()))
+    amplitudes = (shapes @ (weight * h)) / (shapes**2 @ weight)
+    extinction = float(candidates[int(np.argmin((h - amplitudes[:, None] * shapes) ** 2 @ weight))])
     for _ in range(20):
         amplitude, design, normal = linear(extinction)
         if np.linalg.det(normal) <= 1e-12 * normal[0, 0] * max(normal[1, 1], 1e-300):
