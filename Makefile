@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Images of containers often set it. Then each of the hundreds of processes that tests start compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo help install test checks kernels lint types layers house docs figures collected unit audit clean
+.PHONY: demo help install test long checks kernels lint types layers house docs figures collected unit audit clean
 .PHONY: packages pythons accuracy accuracy-rows accuracy-joint accuracy-calibration
 .PHONY: campaign campaign-devices campaign-guard campaign-recording campaign-simulation campaign-calibration
 .PHONY: campaign-inputs
@@ -25,7 +25,10 @@ help:  ## this list
 # compile them. The kernels come first, since they take longest.
 test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
 	$(MAKE) --jobs=2 --output-sync=target kernels checks docs collected NOTEBOOKS=off SITE=docs/_build/check
-	$(PYTEST) --durations=25
+	$(PYTEST) -m "not long" --durations=25
+
+long: kernels  ## tests that `make test` leaves out: more of what shorter tests show (half an hour)
+	$(PYTEST) -m long --durations=25
 
 checks: lint types layers house
 kernels: .venv/.installed-tests

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
 from numba.core.dispatcher import Dispatcher
 
 from rig import api
@@ -40,6 +41,7 @@ EMULATED: dict[str, Any] = {
 SCAN = {"columns": 40, "exposures": 12, "frame_rate": "12.5 kHz"}
 
 
+@pytest.mark.long
 def test_no_kernel_is_compiled_after_arming(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.system.test_compiled_late", str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}

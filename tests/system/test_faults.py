@@ -28,6 +28,7 @@ def test_a_scan_that_is_always_complete_is_found_out(monkeypatch: pytest.MonkeyP
     assert any("nobody says so" in why for seed in range(5) for why in trial(seed, ["blocks lost"])["wrong"])
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="kills a process as POSIX does")
 def test_two_applications_do_not_spoil_each_others_maps() -> None:
     assert together.trial(2)["wrong"] == []

@@ -71,7 +71,8 @@ def test_a_scan_over_emulated_wires_ends_in_a_depth_map_through_fog(scan_slowly,
 
 
 @pytest.mark.parametrize(
-    ("name", "scanner"), [("lab-nidaq-emulated", SLOW_CARD), ("lab-etherdream-emulated", SLOW_BOARD)]
+    ("name", "scanner"),
+    [("lab-nidaq-emulated", SLOW_CARD), pytest.param("lab-etherdream-emulated", SLOW_BOARD, marks=pytest.mark.long)],
 )
 def test_a_small_scan_with_cards_and_boxes_that_labs_have_ends_in_a_depth_map(scan_slowly, tmp_path, name, scanner):
     summary = scan_slowly(name, scanner, columns=30, frame_rate=Fraction(6250))
@@ -82,6 +83,7 @@ def test_a_small_scan_with_cards_and_boxes_that_labs_have_ends_in_a_depth_map(sc
     assert np.isfinite(np.load(tmp_path / "run" / "depth" / "000000.npy")).any()
 
 
+@pytest.mark.long
 def test_a_scan_with_a_spad_without_markers_ends_in_a_depth_map(scan_slowly):
     summary = scan_slowly("lab-spad512s-emulated", frame_rate=Fraction(6250), power=12e-3)
     assert summary["verdict"] == "complete"

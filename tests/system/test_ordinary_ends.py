@@ -17,7 +17,10 @@ def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals and terminals of POSIX")
-@pytest.mark.parametrize(("end", "seed"), [("Ctrl-C twice", 2), ("closed terminal", 1), ("2>&1 | head -1", 1)])
+@pytest.mark.parametrize(
+    ("end", "seed"),
+    [pytest.param("Ctrl-C twice", 2, marks=pytest.mark.long), ("closed terminal", 1), ("2>&1 | head -1", 1)],
+)
 def test_a_cut_that_is_ended_leaves_nothing_or_a_whole_part(materials: Path, end: str, seed: int) -> None:
     found = trial("cut", end, seed, str(materials))
     assert found["wrong"] == [], found

@@ -29,6 +29,7 @@ def test_drop_goes_on_and_accounts_for_every_frame() -> None:
     assert found.exit_code == 1
 
 
+@pytest.mark.long
 def test_abort_ends_at_the_first_block_without_a_slot() -> None:
     found = soak(seconds=0.3, window=True, slow_consumer_ms=SLOW_MS, on_overload="abort")
     assert found.ended_by is not None

@@ -67,6 +67,7 @@ def test_a_replay_by_steps_takes_lines_where_select_takes_only_sockets(run: Path
     assert len(list((tmp_path / "stepped" / "depth").glob("*.npy"))) == 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_pixels_and_lag_are_calibrated(small: Path, tmp_path: Path) -> None:
     ran = rig(

@@ -18,6 +18,8 @@ from calibration.model.rig_model import RigModel
 from rig import api
 from tests.system.calibrate.board_rig import BRIGHT, FOCAL_PX, SIZE, write_board_rig
 
+pytestmark = pytest.mark.long
+
 BOW, ROW_DELAY_S = 0.02, 1e-7
 """Over the 256 rows of 300 px focal length: three pixels, and two and a half columns of one exposure."""
 BASELINE_M = 0.3

@@ -34,6 +34,7 @@ def captured(tmp_path_factory):
     return config, capture_view(config, "000", load_board(), seed=1, out=run), run
 
 
+@pytest.mark.long
 def test_the_board_is_found_where_it_is(captured):
     _, capture, _ = captured
     assert capture.refused is None
@@ -73,6 +74,7 @@ def test_passages_are_those_of_the_scene_without_its_lag(captured):
         assert np.min(passages.direction * (passages.command - begins)) >= passages.speed_per_s * MOST_LAG_S
 
 
+@pytest.mark.long
 def test_windows_of_a_rough_calibration_leave_its_lag_out():
     config = _config()
     config = config.model_copy(update={"spad": type(config.spad)(link="2.4 GB/s")})

@@ -51,6 +51,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PixelResult]
     return file, calibrate_pixels(file, light=True, seed=3, out=folder / "out")
 
 
+@pytest.mark.long
 def test_hot_and_dead_pixels_and_dark_rates_are_those_of_the_sensor(mapped: tuple[Path, PixelResult]) -> None:
     pixels = mapped[1].found.pixels
     rate, stuck, dead = truth()

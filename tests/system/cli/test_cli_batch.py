@@ -39,6 +39,7 @@ def without(times: tuple[str, ...], rows: list[dict[str, Any]]) -> list[dict[str
     return [{key: value for key, value in row.items() if key not in times} for row in rows]
 
 
+@pytest.mark.long
 def test_a_study_of_scans_gives_the_figures_of_scans_whoever_does_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_an_interrupt_keeps_the_views_so_far(calibrated: Path, tmp_path: Path) -
     assert not (tmp_path / "kept" / "calibration.yaml").exists()
 
 
+@pytest.mark.long
 def test_the_guide_asks_for_the_poses_that_make_the_expected_error_fall(calibrated: Path) -> None:
     before_m = json.loads((calibrated / "out" / "summary.json").read_text())["depth_error"]["median_m"]
     told: list[str] = []
@@ -167,6 +168,7 @@ def test_views_that_a_calibration_was_made_of_are_no_check_of_it(calibrated: Pat
     assert "the calibration was made of the same" in ran.problems[0]
 
 
+@pytest.mark.long
 def test_lags_are_found_from_one_unmoved_scene(calibrated: Path, rig: Rig) -> None:
     ran = rig(
         "calibrate", "sync", calibrated / "board-rig.yaml", "--scene", calibrated / "scene.yaml", "--exposures", "3,6",

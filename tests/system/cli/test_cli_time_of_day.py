@@ -87,6 +87,7 @@ def test_a_recording_of_before_there_were_times_is_played_without(rig: Rig, run:
     assert rig("info", run).code == 0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_on_real_drivers_the_uncertainty_is_measured_and_the_frames_lie_within_the_run(
     rig: Rig, tmp_path: Path

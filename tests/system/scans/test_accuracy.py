@@ -71,10 +71,17 @@ def genie_figures(point: WorkingPoint, exposures: int, seed: int) -> dict[str, f
 
 
 CASES = [
-    pytest.param("art", "report", "rectified", 10, id="art, report, rectified"),
-    pytest.param("cones", "report", "turned", 20, id="cones, report, rolled, distorted, tilted, scanner on the right"),
+    pytest.param("art", "report", "rectified", 10, id="art, report, rectified", marks=pytest.mark.long),
+    pytest.param(
+        "cones",
+        "report",
+        "turned",
+        20,
+        marks=pytest.mark.long,
+        id="cones, report, rolled, distorted, tilted, scanner on the right",
+    ),
     pytest.param("motorcycle", "dense", "rectified", 10, id="motorcycle, dense fog, rectified"),
-    pytest.param("moebius", "clear", "turned", 3, id="moebius, clear air, turned"),
+    pytest.param("moebius", "clear", "turned", 3, id="moebius, clear air, turned", marks=pytest.mark.long),
     pytest.param("procedural", "report", "rectified", 1, id="procedural, report, one exposure"),
 ]
 
@@ -107,7 +114,10 @@ def test_naive_estimators_lose_in_fog_and_the_median_filter_helps(tmp_path: Path
     assert error("likelihood", "median") < likelihood
 
 
-@pytest.mark.parametrize(("exposures", "columns", "height", "width"), [(1, 125, 77, 499), (300, 51, 23, 450)])
+@pytest.mark.parametrize(
+    ("exposures", "columns", "height", "width"),
+    [(1, 125, 77, 499), pytest.param(300, 51, 23, 450, marks=pytest.mark.long)],
+)
 def test_any_number_of_exposures_columns_and_pixels(
     tmp_path: Path, reconstruct: Reconstruct, exposures: int, columns: int, height: int, width: int
 ) -> None:
@@ -121,6 +131,7 @@ def test_any_number_of_exposures_columns_and_pixels(
         assert ours["mean_abs"] <= GENIE_RATIO * genie_figures(point, exposures, 1)["mean_abs"]
 
 
+@pytest.mark.long
 def test_in_dense_fog_the_halo_is_not_taken_for_a_wide_line() -> None:
     """A line of 0.8 px was learned as one of 1.85 px here, while wider lines were judged by more pixels."""
     result = scan("simulated", scene="street-dense-fog", estimator="likelihood", exposures=3, seed=31)

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import pytest
+
 from rig import api
 from tests.campaigns.effect_ablation import ablations
 
 
+@pytest.mark.long
 def test_the_full_model_and_the_plan_differ_by_less_than_the_bound(small: Path, tmp_path: Path) -> None:
     config = api.configure(small)
     config = config.model_copy(update={"scan": config.scan.model_copy(update={"columns": 80})})

@@ -72,6 +72,7 @@ def test_confidence_is_the_share_within_a_pixel(empty: bool) -> None:
     assert calibration_error(claimed, right) <= CALIBRATION
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("exposures", "seed", "within"), [(10, 1, 0.8), (1, 3, 0.5)])
 def test_a_first_map_in_dense_fog_does_not_learn_from_its_own_wrong_places(
     exposures: int, seed: int, within: float

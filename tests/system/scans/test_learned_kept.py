@@ -40,6 +40,7 @@ def test_the_next_scan_begins_with_what_was_learned(tmp_path: Path) -> None:
     assert not kept.exists()
 
 
+@pytest.mark.long
 def test_what_does_not_explain_the_first_map_is_learned_anew(tmp_path: Path) -> None:
     rig, kept = write_rig(tmp_path / "rig"), tmp_path / "learned.npz"
     api.scan(rig, seed=1, estimator="joint", learned=kept)
@@ -52,6 +53,7 @@ def test_what_does_not_explain_the_first_map_is_learned_anew(tmp_path: Path) -> 
     assert api.scan(foggy, seed=3, learned=kept).summary.learned == f"from {kept}"
 
 
+@pytest.mark.long
 def test_a_halo_is_kept_with_its_medium(tmp_path: Path) -> None:
     rig, kept = api.configure(write_rig(tmp_path), scene="street-dense-fog", exposures=20), tmp_path / "learned.npz"
     api.scan(rig, seed=1, estimator="joint", learned=kept)

@@ -91,6 +91,7 @@ def test_lines_that_leave_gaps_are_a_usage_error(two_lines: Path, rig: Rig) -> N
     assert "what lies between them is never lit; widen it to 0.8" in ran.problems[0]
 
 
+@pytest.mark.long
 def test_four_lines_at_few_exposures_are_told_apart() -> None:
     """Which of four haze densities a first map begins with is decided on little light here."""
     result = api.scan("simulated-4-lines", exposures=3)

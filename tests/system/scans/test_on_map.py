@@ -180,6 +180,7 @@ def test_the_python_of_the_page_runs(small: Path, tmp_path: Path, monkeypatch: p
     assert api.verify("runs/parts/part-000").exit_code == 0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_real_drivers_are_steered_without_being_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []

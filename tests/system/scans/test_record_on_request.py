@@ -351,6 +351,7 @@ def test_another_process_switches_by_files_in_the_folder(small: Path, tmp_path: 
     assert "write on, off or state" in rig("record", "maybe").problems[0]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_real_drivers_record_parts_of_a_stream(tmp_path: Path) -> None:
     config = small_rig.write_rig(tmp_path / "emulated", small_rig.emulated())

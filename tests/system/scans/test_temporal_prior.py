@@ -14,6 +14,7 @@ def stripes(run: Path) -> list[dict[str, np.ndarray]]:
     return [dict(np.load(file)) for file in sorted((run / "stripe").glob("*.npz"))]
 
 
+@pytest.mark.long
 def test_a_part_gives_the_maps_of_the_whole_bit_for_bit(tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
     options = {"maps": 3, "seed": 5, "estimator": "joint", "exposures": 2}

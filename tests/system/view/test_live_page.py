@@ -193,6 +193,7 @@ def test_the_last_map_stays_when_the_scan_ends(live: Served, open_tab: Open) -> 
     tab.cloud()
 
 
+@pytest.mark.long
 def test_a_page_of_one_process_never_shows_the_scan_of_another(slots: Path, open_tab: Open) -> None:
     """Its button would stop that scan. `rig scan --view` and `rig demo` start such a page."""
     with served("--live", "--process", os.getpid(), folder=slots) as viewer:

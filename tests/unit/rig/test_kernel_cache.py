@@ -190,7 +190,7 @@ def kept(compiled, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ending", "torn"), [("nbi", 0), ("1.nbc", 100)])
+@pytest.mark.parametrize(("ending", "torn"), [pytest.param("nbi", 0, marks=pytest.mark.long), ("1.nbc", 100)])
 def test_a_torn_file_of_kernels_costs_time_and_no_command(kept, ending, torn):
     folder, run = kept
     (file,) = folder.rglob(f"*.{ending}")
@@ -208,6 +208,7 @@ def test_kernels_that_two_processes_have_mixed_up_are_not_called(kept):
     assert run("both") == ["2", "2.5", "2"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @posix
 def test_a_full_disk_keeps_no_kernels_and_stops_none(tmp_path):

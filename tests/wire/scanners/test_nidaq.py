@@ -407,6 +407,7 @@ class Strike:
         return self
 
 
+@pytest.mark.long
 def test_an_interrupt_at_any_line_leaves_the_markers_low_and_no_task(bench: NiBench) -> None:
     at, struck = 0, True
     while struck:  # at every 101st line, until there is none

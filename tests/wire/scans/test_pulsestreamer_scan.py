@@ -24,6 +24,7 @@ from tests.wire.scans.scan_rig import light
 pytestmark = pytest.mark.slow
 
 BLOWS = ("unplugged", "hung", "restarted", "used by another", "scanner unplugged")
+QUICK = ("restarted", "scanner unplugged")
 MAPS = 20_000
 """They take several minutes."""
 
@@ -52,7 +53,9 @@ def test_emission_that_ended_before_is_no_light_and_one_that_goes_on_is() -> Non
     assert light(world, 1.5, 4.0) == [(1.5, 2.0)]
 
 
-@pytest.mark.parametrize("name", BLOWS)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in BLOWS]
+)
 def test_a_scan_whose_gate_is_struck_ends_dark_and_says_so(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -53,6 +53,7 @@ def test_corners_of_few_photons_are_good_to_hundredths_of_a_pixel(light, white_f
     assert 0.6 < np.std(np.concatenate(off)) < 1.5
 
 
+@pytest.mark.long
 def test_corners_of_a_picture_are_not_off_together(light):
     """A fit takes their errors to be independent: what they share, no number of corners averages out."""
     truth = corners_px(CHARUCO, TURNED)

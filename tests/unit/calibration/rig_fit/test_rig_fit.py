@@ -48,6 +48,7 @@ def test_the_depth_error_is_what_the_covariance_says() -> None:
     assert abs(fit.noise.passage_factor - 1) < 0.1
 
 
+@pytest.mark.long
 def test_over_rigs_the_depth_error_is_neither_larger_nor_smaller_than_stated() -> None:
     rig, seen = replace(data.RIG, angle=(0.09, 0.53)), replace(data.SEEN, passages=100)
     squares = []

@@ -154,6 +154,7 @@ def three_views(asked: dict[str, float], camera: KnownCamera | None = None) -> t
     return session, fit, partial(planes_run._judged, session, asked)
 
 
+@pytest.mark.long
 def test_a_camera_that_is_known_counts_in_what_the_guide_expects() -> None:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     lens, known = true_camera(RIG), Covariance(names, np.diag([0.05] * 4 + [1e-4] * 5) ** 2)

@@ -113,6 +113,7 @@ def cases(draw):
     return plan, stream
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(cases())
 def test_every_column_gets_its_exposures_and_the_column_is_where_the_mirror_is(case):

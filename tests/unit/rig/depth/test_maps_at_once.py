@@ -57,7 +57,7 @@ def assert_same(some, others):
             np.testing.assert_array_equal(value, other.learned.arrays()[name], err_msg=name)
 
 
-@pytest.mark.parametrize("lag", [1.5, 2.5])
+@pytest.mark.parametrize("lag", [1.5, pytest.param(2.5, marks=pytest.mark.long)])
 def test_maps_at_once_are_those_of_one_thread_while_lessons_change_the_model(monkeypatch, lag):
     monkeypatch.setattr(online_learning, "TEACH_FRAMES", FRAMES)
     monkeypatch.setattr(online_learning, "LAG_FRAMES", int(lag * FRAMES))

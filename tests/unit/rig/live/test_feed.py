@@ -324,6 +324,7 @@ def test_a_replay_has_a_slot_of_its_kind(small: Path, tmp_path: Path, watched: C
     assert (header["kind"], header["name"]) == ("replay", "take")
 
 
+@pytest.mark.long
 def test_the_lasers_word_comes_from_the_guard_which_asks_it_anyway(
     tmp_path: Path, watched: Callable[..., Watcher]
 ) -> None:

@@ -96,6 +96,7 @@ def latched(plan, stream):
     return np.array([tables[(s - 1) % len(tables)][n] if s else tables[0][0] for s, n in zip(sweep, line, strict=True)])
 
 
+@pytest.mark.long
 @settings(max_examples=80, deadline=None)
 @given(cases())
 def test_every_bound_frame_carries_the_window_of_its_column(case):

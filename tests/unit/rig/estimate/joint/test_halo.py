@@ -103,7 +103,9 @@ def first_map(light):
     return swept, joint, joint.estimate(swept.volume, swept.geometry)
 
 
-@pytest.mark.parametrize(("light", "other"), [("halo", "halo-less"), ("halo-less", "halo")])
+@pytest.mark.parametrize(
+    ("light", "other"), [pytest.param("halo", "halo-less", marks=pytest.mark.long), ("halo-less", "halo")]
+)
 def test_first_and_later_maps_tell_whether_there_is_a_halo(light, other):
     swept, joint, stripes = first_map(light)
     assert joint.used.halo.any() == (light == "halo")
@@ -217,7 +219,8 @@ def light_of(volume, geometry, x_px):
 
 
 @pytest.mark.parametrize(
-    ("rig", "exposures", "amplitude"), [("left", 1, 20.0), ("right", 5, 4.0), ("left", 5, 120.0), ("right", 50, 60.0)]
+    ("rig", "exposures", "amplitude"),
+    [pytest.param("left", 1, 20.0, marks=pytest.mark.long), ("right", 5, 4.0), ("left", 5, 120.0), ("right", 50, 60.0)],
 )
 def test_light_is_that_of_the_stripe_however_full_its_pixels(rig, exposures, amplitude):
     volume, geometry, x_px = wall(rig, exposures, light=amplitude)

@@ -96,6 +96,7 @@ def test_what_stands_still_is_found_better_from_one_exposure():
     assert means[True] < means[False]
 
 
+@pytest.mark.long
 def test_what_moves_is_not_held_back():
     without, prior = measure(procedural_scene(64, 512), Disc(albedo=0.1), exposures=1, maps=3)
     for part, more_px in (("disc", 0.01), ("uncovered", 0.03), ("all", 0.0)):

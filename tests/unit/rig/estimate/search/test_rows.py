@@ -182,7 +182,12 @@ def hard_rows(rng, window, exposures):
 
 
 @pytest.mark.parametrize(
-    ("light", "rig", "exposures"), [("report", "left", 1), ("dense", "turned", 63), ("clear", "right", 63)]
+    ("light", "rig", "exposures"),
+    [
+        ("report", "left", 1),
+        pytest.param("dense", "turned", 63, marks=pytest.mark.long),
+        pytest.param("clear", "right", 63, marks=pytest.mark.long),
+    ],
 )
 def test_scores_of_any_counts_are_sums_of_whole_numbers_and_stop_at_the_limits(light, rig, exposures):
     judge, geometry = judged_rows(rig, exposures, light)

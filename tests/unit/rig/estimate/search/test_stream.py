@@ -125,7 +125,14 @@ def every_map_teaches(monkeypatch):
     monkeypatch.setattr(lessons, "LAG_FRAMES", 1)
 
 
-@pytest.mark.parametrize(("rig", "exposures"), [("left", 100), ("right", 1), ("turned", 10)])
+@pytest.mark.parametrize(
+    ("rig", "exposures"),
+    [
+        pytest.param("left", 100, marks=pytest.mark.long),
+        ("right", 1),
+        pytest.param("turned", 10, marks=pytest.mark.long),
+    ],
+)
 def test_judged_on_the_way_is_judged_afterwards(rig, exposures):
     layout = layout_of(rig, exposures)
     sweeps = [frames_of(rig, exposures, seed) for seed in (1, 2, 3)]

@@ -50,6 +50,7 @@ def test_generators_and_distances_are_those_of_galois() -> None:
     assert all(apart == 2 * correctable(length, bits) + 1 for length, (bits, apart) in CODES.items())
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("length", "bits"), [(15, 5), (63, 10)])
 def test_words_are_those_of_galois(length, bits) -> None:
