@@ -391,7 +391,7 @@ def test_a_job_whose_workers_have_all_gone_is_asked_for_again(monkeypatch: pytes
 def test_the_package_for_batch_systems_does_not_take_interrupts_away(tmp_path: Path) -> None:
     """Its import installs a handler that ends the process with exit code 0."""
     said = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a job in the background ignores it
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in the background
         "from rig.batch.cluster import _dask_jobqueue as get; get(); print(signal.getsignal(signal.SIGINT))"
     )
     ran = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
