@@ -1,5 +1,6 @@
 """Kinds of devices and worlds by name, found through entry points, so that any installed package can add one."""
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
@@ -149,7 +150,10 @@ def load_entry(slot: str, kind: str, entries: Iterable[EntryPoint], wanted: type
         raise UnknownKind(f"{slot}: kind {kind!r} cannot be loaded from {entry.value}: {error}") from error
     if not isinstance(loaded, wanted):
         what = f"{wanted.__module__}.{wanted.__name__}"
-        raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no {what}")
+        members = {*vars(wanted), *inspect.get_annotations(wanted)}
+        lacking = sorted(name for name in members if not name.startswith("_") and not hasattr(loaded, name))
+        why = "a class, where an instance is needed" if isinstance(loaded, type) else f"without {', '.join(lacking)}"
+        raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no {what}, but {why}")
     return loaded
 
 

@@ -219,8 +219,15 @@ class AlignRequest(CheckedRequest):
 class TradeoffRequest(CheckedRequest):
     """Scans of a simulated rig with all combinations of some settings (`rig tradeoff`)."""
 
-    scenes: Sequence[str] = option((), "scenes, separated by commas", unset="the config's", name="scene")
-    fogs: Sequence[str] = option((), "visibilities, or clear: 20m,50m,clear", unset="the scene's", name="fog")
+    scenes: Sequence[str] = option(
+        (), "scenes, by commas", unset="the config's; street,ramp for strategies", name="scene"
+    )
+    fogs: Sequence[str] = option(
+        (),
+        "visibilities or clear; for strategies also rain, snow, own",
+        unset="the scene's, six for strategies",
+        name="fog",
+    )
     exposures: Sequence[int] = option((), "frames per column (K)", unset="1,3,10")
     lines: Sequence[int] = option((), "lines at once", unset="the config's")
     estimators: Sequence[str] = option((), "of argmax, edge, likelihood, joint, by commas", unset="all but argmax")

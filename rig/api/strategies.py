@@ -64,7 +64,7 @@ def compare_strategies(
     if request.out is None:
         return run_comparison(loaded, ways, asked, progress)
     with one_interrupt(), RunFolder(request.out) as folder:
-        return write_files(folder, run_comparison(loaded, ways, asked, progress))
+        return write_files(folder, run_comparison(loaded, ways, asked, progress), _settings(loaded, asked))
 
 
 def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], WriteResults]:
@@ -77,7 +77,7 @@ def as_cases(config: Config, request: StrategiesRequest) -> tuple[list[Case], Wr
 
     def write(folder: RunFolder, found: list[Result | None], aborted: bool) -> object:
         done = tabulate(ways, found, "aborted" if aborted else "complete")
-        return write_files(folder, done) if done.rows else None
+        return write_files(folder, done, _settings(loaded, asked)) if done.rows else None
 
     texts = {parse_quantity(text, "time"): text for text in _once(request.times) or TIMES}
     cases = cases_of(loaded, ways, asked)
@@ -89,8 +89,6 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
     loaded = configure(config)
     names = list(dict.fromkeys(request.strategies)) or [ALL]
     problems = _of_rig_and_request(loaded, request)
-    if ALL in names:  # our own way first
-        names = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
     airs, times = _once(request.fogs) or AIRS, _once(request.times) or TIMES
     problems += air_problems(airs)
     times_s = []
@@ -99,24 +97,45 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
             times_s.append(parse_quantity(text, "time"))
         except ValueError as wrong:
             problems.append(f"`times` {wrong}")
-    problems += [
-        f"`times` has {t:g} s; a measurement takes more than 0 s and at most {LONGEST_S:g} s"
-        for t in times_s
-        if not 0 < t <= LONGEST_S
-    ]
+        else:
+            if not 0 < times_s[-1] <= LONGEST_S:
+                problems.append(f"`times` has {text}; a measurement takes more than 0 s and at most {LONGEST_S:g} s")
     with noted(problems):
-        ways = each_or_problems(names, find_strategy)
+        ways = each_or_problems([name for name in names if name != ALL], find_strategy)
+    scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
+    with (
+        noted(problems),
+        TemporaryDirectory() as made,
+    ):  # a scene that cannot be read is told before others are measured
+        model = rig_model(loaded)
+        if request.rows > max(model.camera.height, StrategiesRequest().rows):
+            problems.append(f"`rows` is {request.rows}; the camera has {model.camera.height}")
+        each_or_problems(scenes.values(), lambda scene: scene_file(scene, None, request.lux, model, Path(made)))
     if problems:
         raise UsageError.of(problems)
-    scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
-    with TemporaryDirectory() as made:  # a scene that cannot be read is told before others have been measured
-        model = rig_model(loaded)
-        each_or_problems(scenes.values(), lambda scene: scene_file(scene, None, request.lux, model, Path(made)))
+    if ALL in names:  # our own way first
+        names = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
+        ways = each_or_problems(names, find_strategy)
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
     own = tuple(None if air == OWN else air for air in airs)
     asked = ComparisonPlan(scenes, own, list(dict.fromkeys(times_s)), rules, request.rows, request.lux, seeds)
     return loaded, ways, asked
+
+
+def _settings(config: RigConfig, asked: ComparisonPlan) -> dict[str, Any]:
+    """What a comparison was asked for, by the names of a `StrategiesRequest`, so that it can be repeated."""
+    return {
+        "config": config.name,
+        "scenes": list(asked.scenes.values()),
+        "fogs": [OWN if air is None else air for air in asked.airs],
+        "times": [f"{1e3 * time_s:g} ms" for time_s in asked.times_s],
+        "rules": list(asked.rules),
+        "rows": asked.rows,
+        "lux": asked.lux,
+        "repeat": len(asked.seeds),
+        "seed": asked.seeds.start,
+    }
 
 
 def _once(given: Sequence[str]) -> tuple[str, ...]:
@@ -128,7 +147,9 @@ def _of_rig_and_request(config: Any, request: StrategiesRequest) -> list[str]:
     """Problems with a rig and options; the names of strategies, air and times apart."""
     problems = []
     if config.world is None or config.world.real_time:
-        problems.append(f"{config.name} has no simulated world of its own time; name a rig that has, '{SIMULATED}'")
+        problems.append(
+            f"{config.name} is no simulated rig that keeps its own time; name one that does, such as '{SIMULATED}'"
+        )
     if len(config.line_offsets) > 1:
         problems.append(f"{config.name} has {len(config.line_offsets)} lines; name a rig with one, '{SIMULATED}'")
     if config.scan.columns < LINES:
@@ -145,7 +166,7 @@ def _of_rig_and_request(config: Any, request: StrategiesRequest) -> list[str]:
     if request.lux is not None and not 0 <= request.lux <= 1e6:
         problems.append(f"`lux` is {request.lux:g}; ambient light is 0 to 1e6 lux")
     if request.repeat < 1:
-        problems.append(f"repeat is {request.repeat}; it must be at least 1")
+        problems.append(f"`repeat` is {request.repeat}; it must be at least 1")
     if not 0 <= request.seed <= MAX_SEED - request.repeat:
-        problems.append(f"seed is {request.seed}; it must be 0 or more and at most {MAX_SEED - request.repeat}")
+        problems.append(f"`seed` is {request.seed}; it must be 0 or more and at most {MAX_SEED - request.repeat}")
     return problems

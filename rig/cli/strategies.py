@@ -14,11 +14,17 @@ if TYPE_CHECKING:
 
 def strategies_tables(done: "Comparison") -> None:
     """Print a comparison to stdout: a table for each scene, air and rule, then ranges, laser classes and times."""
-    from rig.strategies.comparison.tables import FIGURES_NOTE, figures_tables, ranges_table, sources_table
+    from rig.strategies.comparison.tables import (
+        FIGURES_NOTE,
+        figures_tables,
+        ranges_table,
+        sources_table,
+        too_short_lines,
+    )
 
     for table in figures_tables(done.rows):
         _print(table, left=1)
-    tell(f"{FIGURES_NOTE}\n")
+    tell("\n".join((FIGURES_NOTE, *too_short_lines(done.rows))) + "\n")
     if (found := ranges_table(done.rows)) is not None:
         _print(found, left=1)
     _print(sources_table(done.rows, done.seconds), left=4)

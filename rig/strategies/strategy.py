@@ -230,10 +230,13 @@ def find_strategy(name: str) -> Strategy:
     entries = tuple(added(GROUP))
     names = sorted({entry.name for entry in entries})
     if name not in names:
-        similar = [each for each in names if name and name in each][:MOST_SIMILAR]
-        similar = similar or get_close_matches(name, names, MOST_SIMILAR)
+        like = name.lower()
+        similar = [each for each in names if like and like in each][:MOST_SIMILAR]
+        similar = similar or get_close_matches(like, names, MOST_SIMILAR)
         said = f"similar ones are {', '.join(similar)}" if similar else f"choose one of: {', '.join(names)}"
-        raise UsageError(f"no strategy is named {name!r}; {said}, or install the package that has it")
+        raise UsageError(
+            f"no strategy is named {name!r}; {said}; or install the package that has it, again if its names are new"
+        )
     try:
         found = load_entry("strategies", name, entries, Strategy)  # type: ignore[type-abstract]
     except UnknownKind as error:

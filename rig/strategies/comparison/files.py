@@ -1,16 +1,16 @@
 """Writes the files of a comparison: strategies.json, strategies.csv, two pictures, and report.html with all tables.
 
 `strategies.svg` shows error over time in each air, `strategies-visibility.svg` error and range over visibility (only
-written if an air has a visibility). Both show the best strategy of each kind. Strategies are of one kind if the first
-word of their names and their sensor (SPAD or conventional camera) are the same.
+written if an air has a visibility). Of more than MOST_CURVES strategies both show only the best of each kind.
+Strategies are of one kind if the first word of their names and their sensor (SPAD or conventional camera) are the same.
 """
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, Field
 
@@ -24,12 +24,21 @@ from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
 from rig.strategies.comparison.places import RAMP, visibility_m
-from rig.strategies.comparison.tables import FIGURES_NOTE, air_name, figures_tables, ranges_table, sources_table
+from rig.strategies.comparison.tables import (
+    FIGURES_NOTE,
+    air_name,
+    figures_tables,
+    ranges_table,
+    sources_table,
+    too_short_lines,
+)
 
 COMPARISON_FILE: Final = "strategies.json"
 COLOURS: Final = ("#009e73", "#0072b2", "#d55e00", "#cc79a7", "#e69f00", "#56b4e9", "#7b8896", "#8c564b", "#000000",
                   "#9467bd", "#b8b800")  # fmt: skip
 """Colours of kinds, in the order in which they come; the first eight can be told apart by the colour-blind."""
+MOST_CURVES: Final = len(COLOURS)
+"""Largest number of strategies that are all drawn."""
 CAMERA: Final = "camera"
 CLEAR_AT_M: Final = 300.0
 """Place of clear air on the axis of visibility."""
@@ -37,9 +46,10 @@ SHOWN_MS: Final = 50.0
 """Time of measurement in the picture over visibility: the measured time that is nearest to it is shown."""
 
 
-def write_files(folder: RunFolder, done: Comparison) -> Comparison:
-    """Write everything, make the folder appear and return the comparison with its folder."""
-    content = {**done.as_json(), "versions": versions()}
+def write_files(folder: RunFolder, done: Comparison, settings: Mapping[str, Any]) -> Comparison:
+    """Write everything, make the folder appear and return the comparison with its folder. settings: what was asked for,
+    plain values."""
+    content = {**done.as_json(), "settings": dict(settings), "versions": versions()}
     folder.write_json(COMPARISON_FILE, content)
     folder.write_text("strategies.csv", csv_text(done.rows))
     folder.write_text("strategies.svg", time_svg(done.rows))
@@ -57,6 +67,7 @@ class _ComparisonFile(BaseModel):
     notes: list[str]
     strategies: dict[str, str]
     seconds: dict[str, dict[str, float]]
+    settings: dict[str, Any] = {}
     versions: dict[str, str]
 
 
@@ -79,7 +90,7 @@ def _page(name: str, content: _ComparisonFile) -> str:
     if some := _at_shown_time(rows):
         title = f"Error and range over visibility, {some[0].time_ms:g} ms"
         sections.append((title, _charts(_visibility_panels(some), _notes(some))))
-    sections.append(("Each figure in the tables", paragraph(FIGURES_NOTE)))
+    sections.append(("Each figure in the tables", "".join(map(paragraph, (FIGURES_NOTE, *too_short_lines(rows))))))
     sections += [(each.title, table(each.head, each.lines)) for each in figures_tables(rows)]
     if (found := ranges_table(rows)) is not None:
         sections.append((found.title, table(found.head, found.lines)))
@@ -87,11 +98,18 @@ def _page(name: str, content: _ComparisonFile) -> str:
     sections += [
         (sources.title, table(sources.head, sources.lines)),
         ("What they do", table(("", ""), list(content.strategies.items()))),
+        ("Settings", table(("", ""), [(name, _in_words(value)) for name, value in content.settings.items()])),
         ("Versions", table(("", ""), list(content.versions.items()))),
     ]
     said = f"{len(rows)} measurement{'s' * (len(rows) != 1)}, {len(ways)} way{'s' * (len(ways) != 1)} to measure depth."
     box = verdict_box(content.verdict, said, content.notes, good=content.verdict == "complete")
     return page(f"Comparison {name}", [box], sections)
+
+
+def _in_words(setting: Any) -> str:
+    if setting is None:
+        return "the scene's own"
+    return ", ".join(map(str, setting)) if isinstance(setting, list) else str(setting)
 
 
 def _charts(panels: Sequence[Panel], notes: Sequence[str]) -> str:
@@ -107,6 +125,12 @@ def kind_of(strategy: str) -> str:
     """Kind of a strategy: the first word of its name, and `camera` if a conventional camera looks."""
     first, *more = strategy.split("-")
     return f"{first}-{CAMERA}" if more and more[-1] == CAMERA else first
+
+
+def shown_ways(rows: Sequence[StrategyRow]) -> list[str]:
+    """The strategies that a figure shows: all, or the best of each kind if there are more than MOST_CURVES."""
+    ways = list(dict.fromkeys(row.strategy for row in rows))
+    return ways if len(ways) <= MOST_CURVES else best_of_kinds(rows)
 
 
 def best_of_kinds(rows: Sequence[StrategyRow]) -> list[str]:
@@ -125,15 +149,15 @@ def time_svg(rows: Sequence[StrategyRow]) -> str:
 
 
 def _time_panels(rows: Sequence[StrategyRow]) -> list[Panel]:
-    shown = best_of_kinds(rows)
+    shown, rules = shown_ways(rows), list(dict.fromkeys(row.rule for row in rows))
     return [
         Panel(
-            title=f"{'own air' if air is None else air_name(air)}{'' if rule == 'energy' else ', equal irradiance'}",
+            title=("own air" if air is None else air_name(air)) + (f", equal {rule}" if len(rules) > 1 else ""),
             x_label="time of a measurement, ms",
             y_label="mean error, px",
             series=_curves([row for row in rows if (row.air, row.rule) == (air, rule)], shown, lambda row: row.time_ms),
         )
-        for rule in dict.fromkeys(row.rule for row in rows)
+        for rule in rules
         for air in dict.fromkeys(row.air for row in rows)
     ]
 
@@ -156,7 +180,7 @@ def _at_shown_time(rows: Sequence[StrategyRow]) -> list[StrategyRow]:
 
 
 def _visibility_panels(some: Sequence[StrategyRow]) -> list[Panel]:
-    shown = best_of_kinds(some)
+    shown = shown_ways(some)
     return [
         Panel("error", "visibility, m (right end: clear air)", "mean error, px", _curves(some, shown, _visible)),
         Panel(
@@ -177,16 +201,19 @@ def _curves(
     """A curve for each strategy shown, its points the means over scenes."""
     colours: dict[str, str] = {}
     curves = []
-    for name in shown:
-        kind = kind_of(name)
-        colour = colours.setdefault(kind.removesuffix(f"-{CAMERA}"), COLOURS[len(colours) % len(COLOURS)])
+    kinds = list(map(kind_of, shown))
+    alone = len(set(kinds)) == len(kinds)
+    for name, kind in zip(shown, kinds, strict=True):
+        # The same patterns seen by the SPAD and by a camera have one colour.
+        like = (kind if alone else name.removesuffix("-spad")).removesuffix(f"-{CAMERA}")
+        colour = colours.setdefault(like, COLOURS[len(colours) % len(COLOURS)])
         places: dict[float, list[float]] = {}
         for row in rows:
             found = value(row) if row.strategy == name else None
             if found is not None:
                 places.setdefault(at(row), []).append(found)
         points = [(x, statistics.fmean(values)) for x, values in sorted(places.items())]
-        curves.append(Series(name, colour, points, dashed=kind.endswith(CAMERA)))
+        curves.append(Series(name, colour, points, dashed=kind.endswith(f"-{CAMERA}")))
     return curves
 
 
@@ -203,8 +230,14 @@ def _range(row: StrategyRow) -> float | None:
 
 def _notes(rows: Sequence[StrategyRow]) -> list[str]:
     scenes = ", ".join(dict.fromkeys(row.scene for row in rows))
+    shown = shown_ways(rows)
+    left_out = [way for way in dict.fromkeys(row.strategy for row in rows) if way not in shown]
+    of_kinds = (
+        "The way with the least mean error is shown of each kind (first word of a name, and camera), "
+        f"{len(left_out)} are left out. "
+    )
     return [
         f"Scenes: {scenes}. Mean error of disparity over all pixels that camera and source see; a missing answer and "
         f"a larger error count as {MISSING_PX:g} px.",
-        "Of each kind the way with the least mean error is shown. Dashed: a conventional camera looks.",
+        f"{of_kinds if left_out else ''}Dashed: a conventional camera looks.",
     ]

@@ -7,6 +7,7 @@ that of the scene; a scene without any gets that of the bundled scenes.
 """
 
 import os
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +33,8 @@ WEATHER: Final[dict[str, dict[str, Any]]] = {
 """Air by name: heavy rain and moderate snow, as in the bundled scenes."""
 USUAL_LUX: Final = 5.0
 """Ambient light, in lux, of a scene that states none. The bundled scenes have it: a street at night."""
+LEAST_VISIBLE_M: Final = 0.1
+"""Smoke is hardly ever denser than this visibility."""
 RAMP: Final = "ramp"
 RAMP_M: Final = (1.2, 14.0)
 TEXTURE_PX: Final = 6
@@ -46,13 +49,15 @@ def air_problems(airs: "list[str] | tuple[str, ...]") -> list[str]:
         if air in (CLEAR, OWN) or air in WEATHER:
             continue
         try:
-            visible = parse_quantity(air, "length") > 0
+            visible_m = parse_quantity(air, "length")
         except ValueError:
-            visible = False
-        if not visible:
             problems.append(
-                f"fog {air!r} is no air; write a visibility such as 20m, or {CLEAR}, {', '.join(WEATHER)} or {OWN}"
+                f"`fogs` has {air!r}; write a visibility with a unit such as 20m, or {CLEAR}, {', '.join(WEATHER)} or "
+                f"{OWN}"
             )
+        else:
+            if visible_m < LEAST_VISIBLE_M:
+                problems.append(f"`fogs` has {air!r}; a visibility is at least {LEAST_VISIBLE_M:g} m")
     return problems
 
 
@@ -100,9 +105,10 @@ def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     try:
         content = load_yaml(path, "a scene", "surfaces: street").content
     except FileError as error:
-        reason = "; ".join(error.problems)
+        near = get_close_matches(scene, [*bundled, RAMP], n=1)
         raise UsageError(
-            f"scene {scene!r} cannot be read ({reason}); name a bundled scene, a scene file, a folder or {RAMP!r}"
+            f"{'; '.join(error.problems)}; {f'did you mean {near[0]}? ' if near else ''}Name a scene of those that "
+            f"'rig scenes' lists, a scene file, a folder or {RAMP!r}"
         ) from error
     surfaces = content.get("surfaces", "street")
     if isinstance(surfaces, str) and surfaces not in ("street", "board"):

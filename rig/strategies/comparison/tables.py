@@ -10,7 +10,7 @@ from rig.strategies.comparison.compare import StrategyRow, ranges
 from rig.strategies.comparison.places import CLEAR, RAMP, visibility_m
 
 FIGURES_NOTE: Final = (
-    "Mean error in px, pixels within 2 % of the depth in %, confident wrong ones in %. A missing answer and a larger "
+    "Mean error in px / pixels within 2 % of the depth in % / confident wrong ones in %. A missing answer and a larger "
     f"error count as {MISSING_PX:g} px. -: cannot measure in so short a time."
 )
 
@@ -41,7 +41,7 @@ def figures_tables(rows: Sequence[StrategyRow]) -> Iterator[FiguresTable]:
 def _figures(row: StrategyRow) -> str:
     if row.mean_px is None or row.good is None or row.confident_wrong is None:
         return "-"
-    return f"{row.mean_px:.3f} {100 * row.good:.0f} {100 * row.confident_wrong:.1f}"
+    return f"{row.mean_px:.3f} / {100 * row.good:.0f} / {100 * row.confident_wrong:.1f}"
 
 
 def ranges_table(rows: Sequence[StrategyRow]) -> FiguresTable | None:
@@ -72,8 +72,17 @@ def sources_table(rows: Sequence[StrategyRow], seconds: Mapping[str, Mapping[str
         row = next(of[way] for of in by_rule if way in of)
         spent = (digits(seconds.get(way, {}).get(scene, 0.0), 3) for scene in scenes)
         lines.append((way, row.light, row.laser_class or "-", row.laser_class_still or "-", *spent))
-    head = ("", "lights", "laser class", "if it stands", *(f"s, {scene}" for scene in scenes))
-    return FiguresTable("Sources, and seconds of this computer with the simulation", head, lines)
+    head = ("", "lights", "laser class", "if it stood still", *(f"{scene}, s" for scene in scenes))
+    return FiguresTable("Sources at the longest time, and computing time with the simulation", head, lines)
+
+
+def too_short_lines(rows: Sequence[StrategyRow]) -> list[str]:
+    """A line for each strategy that cannot measure in one of the times, with the longest such time and the reason."""
+    longest: dict[str, StrategyRow] = {}
+    for row in rows:
+        if row.too_short is not None and (row.strategy not in longest or row.time_ms > longest[row.strategy].time_ms):
+            longest[row.strategy] = row
+    return [f"{way}, {row.time_ms:g} ms: {row.too_short}" for way, row in longest.items()]
 
 
 def air_name(air: str) -> str:

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -28,10 +29,17 @@ from rig.strategies.comparison.compare import (
     require_form,
     run_comparison,
 )
-from rig.strategies.comparison.files import best_of_kinds, csv_text, kind_of, time_svg, visibility_svg
+from rig.strategies.comparison.files import (
+    MOST_CURVES,
+    best_of_kinds,
+    csv_text,
+    kind_of,
+    time_svg,
+    visibility_svg,
+)
 from rig.strategies.comparison.places import air_problems, scene_file, scene_path, visibility_m
 from rig.strategies.comparison.scene import OpenScene, Place, close_scene, open_scene
-from rig.strategies.comparison.tables import figures_tables, ranges_table, sources_table
+from rig.strategies.comparison.tables import figures_tables, ranges_table, sources_table, too_short_lines
 from rig.strategies.strategy import Answer, find_strategy
 from tests.stability.inventory import covers
 from tests.system import small_rig
@@ -284,8 +292,8 @@ def test_a_flash_of_equal_irradiance_has_twice_the_power(config, monkeypatch):
     ("changes", "said"),
     [
         ({"strategies": ["nonsense"]}, "nonsense"),
-        ({"fogs": ["20"]}, "no air"),
-        ({"fogs": ["0 m"]}, "no air"),
+        ({"fogs": ["20"]}, "visibility with a unit"),
+        ({"fogs": ["0 m"]}, "at least 0.1 m"),
         ({"times": ["fast"]}, "times"),
         ({"times": ["0 s"]}, "more than 0 s"),
         ({"times": ["101 s"]}, "at most 100 s"),
@@ -296,7 +304,9 @@ def test_a_flash_of_equal_irradiance_has_twice_the_power(config, monkeypatch):
         ({"seed": -1}, "seed"),
         ({"exposures": [3]}, "exposures"),
         ({"limits": False}, "limits"),
-        ({"scenes": ["no/such.yaml"]}, "cannot be read"),
+        ({"scenes": ["stret"]}, "did you mean street"),
+        ({"strategies": ["all", "gray-sapd"]}, "gray-sapd"),
+        ({"rows": 10_000}, "the camera has"),
     ],
 )
 def test_wrong_requests_are_refused_in_a_line(config, changes, said):
@@ -344,7 +354,10 @@ def test_a_picture_shows_the_best_of_each_kind():
     rows = [row(), row("line-edge", mean_px=2.0), row("line-camera", mean_px=3.0), row("gray-spad", mean_px=None)]
     assert best_of_kinds(rows) == ["line-joint", "line-camera", "gray-spad"]
     assert (kind_of("phase-gray-camera"), kind_of("bch"), kind_of("line-4-joint")) == ("phase-camera", "bch", "line")
-    assert "line-edge" not in time_svg(rows)
+    assert "line-edge" in time_svg(rows), "as few as these are all drawn"
+    many = [*rows, *(row(f"gray-{i}", mean_px=9.0) for i in range(MOST_CURVES))]
+    assert "line-edge" not in time_svg(many)
+    assert f"{MOST_CURVES + 1} are left out" in " ".join(re.findall(r">([^<]+)<", time_svg(many)))
     both = visibility_svg([*rows, row(air="20m"), row(air="20m", time_ms=1.0)])
     assert "50 ms" in both
 
@@ -373,8 +386,9 @@ def test_tables_have_a_line_for_each_way_also_if_it_was_measured_by_one_rule_alo
     energy, irradiance = figures_tables([*rows, row("line-edge", 50.0)])
     assert energy.title == "street, visibility 20m, equal energy"
     assert energy.head == ("", "1 ms", "50 ms")
-    assert energy.lines == [("line-joint", "-", "0.004 98 1.0"), ("line-edge", "", "0.004 98 1.0")]
+    assert energy.lines == [("line-joint", "-", "0.004 / 98 / 1.0"), ("line-edge", "", "0.004 / 98 / 1.0")]
     assert [line[0] for line in irradiance.lines] == ["gray-spad", "line-joint"]
     sources = sources_table(rows, {"line-joint": {"street": 2.0}})
     assert sources.lines == [("line-joint", "line", "3R", "-", "2"), ("gray-spad", "line", "1", "-", "0")]
     assert ranges_table(rows) is None
+    assert too_short_lines([*rows, row("line-joint", 2.0, too_short="needs 3 ms")]) == ["line-joint, 2 ms: needs 3 ms"]

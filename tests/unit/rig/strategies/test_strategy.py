@@ -89,6 +89,7 @@ def test_unknown_broken_and_doubled_names_are_said_in_one_line(monkeypatch):
         EntryPoint("twice", "rig.strategies.line_scan:EDGE", group),
         EntryPoint("other", "rig.strategies.line_scan:JOINT", group),
         EntryPoint("number", "math:pi", group),
+        EntryPoint("class", "fractions:Fraction", group),
         EntryPoint("striped", f"{__name__}:STRIPED", group),
     ]
     monkeypatch.setattr(module, "added", lambda group: entries)
@@ -96,10 +97,11 @@ def test_unknown_broken_and_doubled_names_are_said_in_one_line(monkeypatch):
         "gone": "cannot be loaded",
         "twice": "offered twice",
         "other": "calls itself",
-        "number": "is no",
-        "xyz": "no strategy is named 'xyz'; choose one of: gone, number, other, striped, twice, or install",
-        "the": "similar ones are other, or install",
-        "twise": "similar ones are twice, or install",
+        "number": "is no rig.strategies.strategy.Strategy, but without clear_px, light, ",
+        "class": "but a class, where an instance is needed",
+        "xyz": "no strategy is named 'xyz'; choose one of: class, gone, number, other, striped, twice; or install",
+        "the": "similar ones are other; or install",
+        "twise": "similar ones are twice; or install",
         "striped": "one of spot",
     }
     for name, said in problems.items():
