@@ -124,7 +124,7 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
 
 
 def _settings(config: RigConfig, asked: ComparisonPlan) -> dict[str, Any]:
-    """What a comparison was asked for, by the names of a `StrategiesRequest`, so that it can be repeated."""
+    """The request of a comparison, by the names of a `StrategiesRequest`, so that it can be repeated."""
     return {
         "config": config.name,
         "scenes": list(asked.scenes.values()),
