@@ -77,7 +77,7 @@ def served(*arguments: object, folder: Path) -> Iterator[Served]:
         process.terminate()
         out, _ = process.communicate(timeout=PATIENCE_S)
         reader.join(PATIENCE_S)
-        assert process.returncode == 0, said
+        assert process.returncode == 0, "\n".join(said)
         assert out == "", "whatever viser prints is not for stdout"
 
 
