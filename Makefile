@@ -23,11 +23,11 @@ help:  ## this list
 
 # The kernels are compiled once, by one core, while the other makes all else: four workers that start cold would each
 # compile them. The kernels come first, since they take longest.
-test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests
+test: .venv/.installed-tests  ## lint, types, import layers, the tree's figures, the site and all tests but long ones
 	$(MAKE) --jobs=2 --output-sync=target kernels checks docs collected NOTEBOOKS=off SITE=docs/_build/check
 	$(PYTEST) -m "not long" --durations=25
 
-long: kernels  ## tests that `make test` leaves out: more of what shorter tests show (half an hour)
+long: kernels  ## tests that `make test` leaves out: more of what shorter tests show (ten minutes)
 	$(PYTEST) -m long --durations=25
 
 checks: lint types layers house

@@ -150,9 +150,11 @@ def load_entry(slot: str, kind: str, entries: Iterable[EntryPoint], wanted: type
         raise UnknownKind(f"{slot}: kind {kind!r} cannot be loaded from {entry.value}: {error}") from error
     if not isinstance(loaded, wanted):
         what = f"{wanted.__module__}.{wanted.__name__}"
-        members = {*vars(wanted), *inspect.get_annotations(wanted)}
+        members = {*vars(wanted), *inspect.get_annotations(wanted)} if getattr(wanted, "_is_protocol", False) else set()
         lacking = sorted(name for name in members if not name.startswith("_") and not hasattr(loaded, name))
-        why = "a class, where an instance is needed" if isinstance(loaded, type) else f"without {', '.join(lacking)}"
+        why = f"without {', '.join(lacking)}" if lacking else f"of type {type(loaded).__name__}"
+        if isinstance(loaded, type):
+            why = "a class, where an instance is needed"
         raise UnknownKind(f"{slot}: entry point {entry.value} of kind {kind!r} is no {what}, but {why}")
     return loaded
 

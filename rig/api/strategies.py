@@ -102,20 +102,18 @@ def _prepared(config: Config, request: StrategiesRequest) -> tuple[RigConfig, li
                 problems.append(f"`times` has {text}; a measurement takes more than 0 s and at most {LONGEST_S:g} s")
     with noted(problems):
         ways = each_or_problems([name for name in names if name != ALL], find_strategy)
+        if ALL in names:  # our own way first
+            every = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
+            ways = each_or_problems(every, find_strategy)
     scenes = {name: scene for scene, name in short_names(_once(request.scenes) or SCENES).items()}
-    with (
-        noted(problems),
-        TemporaryDirectory() as made,
-    ):  # a scene that cannot be read is told before others are measured
+    # A scene that cannot be read is told before others have been measured.
+    with noted(problems), TemporaryDirectory() as made:
         model = rig_model(loaded)
         if request.rows > max(model.camera.height, StrategiesRequest().rows):
             problems.append(f"`rows` is {request.rows}; the camera has {model.camera.height}")
         each_or_problems(scenes.values(), lambda scene: scene_file(scene, None, request.lux, model, Path(made)))
     if problems:
         raise UsageError.of(problems)
-    if ALL in names:  # our own way first
-        names = sorted(strategy_names(), key=lambda name: (not name.startswith("line"), name))
-        ways = each_or_problems(names, find_strategy)
     seeds = range(request.seed, request.seed + request.repeat)
     rules = cast(tuple[Rule, ...], _once(request.rules) or RULES)
     own = tuple(None if air == OWN else air for air in airs)

@@ -19,8 +19,8 @@ from tests.campaigns.outcomes import Outcomes, campaign
         ("pulsestreamer", 20, 20, "done", 1),  # in the host's time: a slow machine gets fewer answers
         ("helios", 60, 1, "complete", 1),
         ("lasercube", 50, 1, "complete", 1),
-        ("etherdream", 25, 1, "complete", 1),
-        ("nidaq", 15, 1, "complete", 1),
+        ("etherdream", 50, 1, "complete", 1),
+        ("nidaq", 50, 1, "complete", 1),
         ("spad512s", 20, 20, "complete", 1),
         ("spb-usb", 50, 25, "complete", 1),
     ],

@@ -23,7 +23,7 @@ from rig.report.page import Section, charts, page, paragraph, table, verdict_box
 from rig.run_folder.folder import RunFolder
 from rig.scan.run import versions
 from rig.strategies.comparison.compare import Comparison, StrategyRow
-from rig.strategies.comparison.places import RAMP, visibility_m
+from rig.strategies.comparison.places import RAMP, USUAL_LUX, visibility_m
 from rig.strategies.comparison.tables import (
     FIGURES_NOTE,
     air_name,
@@ -107,8 +107,9 @@ def _page(name: str, content: _ComparisonFile) -> str:
 
 
 def _in_words(setting: Any) -> str:
+    """A setting as text. Only the ambient light can be None."""
     if setting is None:
-        return "the scene's own"
+        return f"the scene's, else {USUAL_LUX:g}"
     return ", ".join(map(str, setting)) if isinstance(setting, list) else str(setting)
 
 
@@ -230,11 +231,10 @@ def _range(row: StrategyRow) -> float | None:
 
 def _notes(rows: Sequence[StrategyRow]) -> list[str]:
     scenes = ", ".join(dict.fromkeys(row.scene for row in rows))
-    shown = shown_ways(rows)
-    left_out = [way for way in dict.fromkeys(row.strategy for row in rows) if way not in shown]
+    left_out = len({row.strategy for row in rows}) - len(shown_ways(rows))
     of_kinds = (
         "The way with the least mean error is shown of each kind (first word of a name, and camera), "
-        f"{len(left_out)} are left out. "
+        f"{left_out} are left out. "
     )
     return [
         f"Scenes: {scenes}. Mean error of disparity over all pixels that camera and source see; a missing answer and "

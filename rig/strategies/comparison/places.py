@@ -107,7 +107,7 @@ def _content(scene: str, model: RigModel, folder: Path) -> dict[str, Any]:
     except FileError as error:
         near = get_close_matches(scene, [*bundled, RAMP], n=1)
         raise UsageError(
-            f"{'; '.join(error.problems)}; {f'did you mean {near[0]}? ' if near else ''}Name a scene of those that "
+            f"{'; '.join(error.problems)}; {f'did you mean {near[0]}? ' if near else ''}name a scene of those that "
             f"'rig scenes' lists, a scene file, a folder or {RAMP!r}"
         ) from error
     surfaces = content.get("surfaces", "street")

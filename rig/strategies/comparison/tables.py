@@ -78,10 +78,8 @@ def sources_table(rows: Sequence[StrategyRow], seconds: Mapping[str, Mapping[str
 
 def too_short_lines(rows: Sequence[StrategyRow]) -> list[str]:
     """A line for each strategy that cannot measure in one of the times, with the longest such time and the reason."""
-    longest: dict[str, StrategyRow] = {}
-    for row in rows:
-        if row.too_short is not None and (row.strategy not in longest or row.time_ms > longest[row.strategy].time_ms):
-            longest[row.strategy] = row
+    too_short = sorted((row for row in rows if row.too_short is not None), key=lambda row: row.time_ms)
+    longest = {row.strategy: row for row in too_short}
     return [f"{way}, {row.time_ms:g} ms: {row.too_short}" for way, row in longest.items()]
 
 

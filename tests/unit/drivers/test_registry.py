@@ -50,7 +50,7 @@ def test_kinds_are_listed_once_and_sorted_and_one_that_is_found_creates_its_devi
     [
         ("laser", "lmap", "laser: unknown kind 'lmap'; choose one of: arc, broken, gone, lamp, same, twice"),
         ("spad", "lamp", "none installed"),
-        ("laser", "broken", r"no drivers\.registry\.Kind"),
+        ("laser", "broken", r"no drivers\.registry\.Kind, but of type object"),
         ("laser", "gone", "'gone' cannot be loaded from .*NOT_THERE"),
         ("laser", "twice", "offered twice"),
     ],
